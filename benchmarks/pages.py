@@ -88,13 +88,29 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         found = {name: next(iter(x.values())) for name, x in files["handheld"].items()}
         return sorted(x[key][-1] for name, x in found.items() if name.startswith("handheld"))
 
+    def accused(test: str = "verdict", *without: str) -> float:
+        """The largest share of right filters that a test of one run calls over-confident."""
+        rows = (row for row in files["one_run"]["right"] if row["name"] not in without)
+        return max(row["over_confident"][test] for row in rows)
+
+    def cautious(name: str) -> list[float]:
+        """The least and the largest share of right filters of a kind whose NEES seems too small."""
+        found = [row["cautious"] for row in files["one_run"]["right"] if row["name"] == name]
+        return [min(found), max(found)]
+
+    def shown(factor: float) -> float:
+        """The least share of filters whose σ is too small by a factor that one run shows."""
+        rows = (row for row in files["one_run"]["wrong"] if row["factor"] == factor)
+        return min(row["over_confident"]["verdict"] for row in rows)
+
     def on_gpu(name: str, dtype: str = "float64") -> float:
         """µs a step of a run in batches of 10,000."""
         found = files["gpu"]["filters"][name][dtype]["device"]["10000"]
         return found["microseconds_per_step"]
 
     functions = (
-        row, mean, sigma, lost, end, step, theirs, observed, initialised, walked, on_gpu,
+        row, mean, sigma, lost, end, step, theirs, observed, initialised, walked, accused, cautious,
+        shown, on_gpu,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 

@@ -1,7 +1,8 @@
 """The causes of a wrong NEES that lie between the logs, not in the filter.
 
-Quaternions with w first, a constant rotation and lever arm between the bodies, two worlds, an alignment that takes what the filter observes, half angles, runs with the same rows.
-Each is found only beyond doubt, with a number and the NEES without it; then there is no verdict.
+Quaternions with w first, a constant rotation and lever arm between the bodies, two worlds, an
+alignment of what the filter observes, half angles, runs that are the same. Each is found only
+beyond doubt, with a number and the NEES without it; then there is no verdict.
 """
 
 from __future__ import annotations

@@ -238,7 +238,19 @@ def correlations(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarr
 
 
 def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerStep:
-    """Return `eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
+    """Return `eᵀ P⁻¹ e`. Raises ValueError as `whitened` does."""
+    return squared(whitened(errors, covariances))
+
+
+def squared(whitened: PerAxis) -> PerStep:
+    """Return the sum of squares over the axes; infinite where it is not a number."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        nees = np.sum(whitened**2, axis=-1)
+    return np.where(np.isnan(nees), np.inf, nees)
+
+
+def whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerAxis:
+    """Return `L⁻¹ e`, with `P = L Lᵀ`, by a Cholesky factor of the correlations.
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
     """
@@ -258,9 +270,7 @@ def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]
         _refuse(place, f"is not symmetric (by {skewed[tuple(place)]:.2g} in σ)")
     correlation = (correlation + np.swapaxes(correlation, -1, -2)) / 2
     with np.errstate(over="ignore", invalid="ignore"):  # infinite: of a run that diverged
-        whitened = np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
-        nees = np.sum(whitened**2, axis=-1)
-    return np.where(np.isnan(nees), np.inf, nees)
+        return np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
 
 
 def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:

@@ -283,8 +283,8 @@ def evaluate_runs(
         if after < before / CLEARLY:
             clock = Mistake(
                 "the clocks of estimate and truth differ",
-                f"the stamps of the estimate are {1e3 * offset:.1f} ± {1e3 * sigma:.1g} ms late, by "
-                f"its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
+                f"the stamps of the estimate are {1e3 * offset:.1f} ± {1e3 * sigma:.1g} ms late, "
+                f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
                 f"instead of {before:.4g}",
             )
             found = replace(found, causes=(clock,))

@@ -32,14 +32,16 @@ from jaxslam.evaluation.inputs import (
     filled,
     normalised,
     sigmas,
+    squared,
     step_times,
+    whitened,
     without_known,
 )
 from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
-from jaxslam.statistics.bands import Mask, PerStep
+from jaxslam.statistics.bands import Mask, PerAxis
 
 BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
@@ -61,7 +63,7 @@ class _PoseErrors(NamedTuple):
 
     errors: Float[np.ndarray, "runs steps m"]
     covariances: Float[np.ndarray, "runs steps m m"]
-    nees: PerStep
+    whitened: PerAxis
     start: int
     logged: Mask
     fitted: float
@@ -134,7 +136,8 @@ def as_stated(
     return Evaluation(
         quantity="NEES",
         dof=len(used),
-        nees=filled(found.nees, found.logged, np.nan),
+        nees=filled(squared(found.whitened), found.logged, np.nan),
+        whitened=filled(found.whitened, found.logged, np.nan),
         errors=filled(found.errors, found.logged, np.nan),
         sigmas=filled(sigmas(found.covariances), found.logged, np.nan),
         times=step_times(None, poses.estimates.shape[1])[found.start :],
@@ -163,7 +166,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     errors, P = errors[:, start:], later.covariances[..., axes[:, None], axes]
     fitted, axis_fitted, scale, notes = 0.0, np.zeros(len(axes)), None, (*known, *world.notes)
     if world.given or align == "sim3":
-        normalised(errors, P)  # refuses what is not positive definite, by run and step
+        whitened(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
         P, (metres, degrees) = later.covariances[..., axes[:, None], axes], truth_sigma
@@ -173,8 +176,9 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
         notes += (BEYOND,)
     elif align == "sim3":
         scale = of_aligned(later, convention, axes, _log_scales(poses, world.poses))
-    nees = normalised(errors, P)
-    return _PoseErrors(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
+    return _PoseErrors(
+        errors, P, whitened(errors, P), start, later.logged, fitted, axis_fitted, scale, notes
+    )
 
 
 def _later(poses: Poses, start: int, logged: Mask) -> Poses:
@@ -256,7 +260,7 @@ def _tried(
         e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
         return filled(normalised(e, P), found.logged, np.nan)
 
-    nees = filled(found.nees, found.logged, np.nan)
+    nees = filled(squared(found.whitened), found.logged, np.nan)
     log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
     parts = (of(block) if block.any() else None for block in (~turns, turns))
     return Tried(nees, len(names), found.fitted, log_determinant, *parts, int(turns.sum()))

@@ -68,6 +68,9 @@ class Verdict(dict[str, Any]):
     """The verdicts on each third of the steps."""
     never_lost: Verdict
     """The verdict on the runs that are never lost."""
+    effective: float
+    """The number of independent steps that the steps of the only run are worth, where there is
+    one run, whose errors are known."""
 
     def __getattr__(self, name: str) -> Any:
         try:

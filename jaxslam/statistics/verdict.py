@@ -7,8 +7,16 @@ from dataclasses import asdict, astuple, dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.statistics.bands import Mask, PerStep, PowerSums, lost_threshold, whiteness_p_value
+from jaxslam.statistics.bands import (
+    Mask,
+    PerAxis,
+    PerStep,
+    PowerSums,
+    lost_threshold,
+    whiteness_p_value,
+)
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Found, Look, Verdict
+from jaxslam.statistics.one_run import FEWEST, one_run, one_run_of_nees
 
 LOST_BOUND = 0.01
 """More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
@@ -236,17 +244,44 @@ def run_verdict(
     dof: int,
     fitted: float = 0.0,
     logged: Bool[np.ndarray, "runs steps"] | None = None,
+    whitened: Float[np.ndarray, "runs steps axes"] | None = None,
 ) -> Verdict:
     """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`.
 
-    For `fitted` and `logged` see `Tally.of`. Raises ValueError unless there are runs, steps and
-    degrees of freedom.
+    For `fitted` and `logged` see `Tally.of`. Of one run the `whitened` errors `L⁻¹ e` say how many
+    independent steps its steps are worth, `effective`; they may show that it is over-confident
+    (`jaxslam.statistics.one_run`), and never anything else: `samples` is then `effective`. Without
+    an axis they say only that NEES alone is known. Raises ValueError unless there are runs, steps
+    and degrees of freedom.
     """
     nees = np.asarray(nees, np.float64)
     if nees.ndim != 2 or not nees.size or dof < 1:
         raise ValueError(f"NEES must be (runs, steps) with dof ≥ 1, not {nees.shape} and {dof}")
     found = Tally.of(nees, dof, fitted, logged).verdict()
-    return found | {"lost_runs": lost_runs(nees, dof, logged)}
+    found |= {"lost_runs": lost_runs(nees, dof, logged)}
+    if whitened is None or len(nees) > 1 or found["diverged"]:
+        return found
+    there = _logged(nees, logged)
+    nees, whitened = np.where(there, nees, np.nan), np.where(there[..., None], whitened, np.nan)
+    return _of_one_run(found, nees, whitened, dof)
+
+
+def _of_one_run(found: Verdict, nees: PerStep, whitened: PerAxis, dof: int) -> Verdict:
+    """A verdict on one run, or that it is over-confident by what its steps are worth."""
+    one = one_run(whitened[0]) if whitened.shape[-1] else one_run_of_nees(nees[0], dof)
+    found |= {"effective": one.samples}
+    if not one.over_confident:
+        return found
+    return found | {
+        "word": "over-confident",
+        "nees": found["mean"]["nees"],
+        "sigma_factor": one.sigma_factor,
+        "interval99": list(one.interval99),
+        "p": one.p,
+        "of": "all steps",
+        "enough": None,
+        "samples": "effective",
+    }
 
 
 def not_disproved(found: Found) -> bool:
@@ -261,6 +296,8 @@ def sentences(found: Found, quantity: str = "NEES") -> list[str]:
     """
     told = [headline(found, quantity)]
     if found["nees"] is not None:
+        if "effective" in found:
+            told.append(_of_effective(found))
         if _part(found) != "all steps":
             told.append(f"over all steps: {_said(found['mean'], quantity)}")
         if _part(found) != "last step":
@@ -270,6 +307,16 @@ def sentences(found: Found, quantity: str = "NEES") -> list[str]:
     if found["lost"]:
         told.append(_of_lost(found, quantity))
     return told
+
+
+def _of_effective(found: Found) -> str:
+    """A sentence on what the correlated steps of one run are worth."""
+    number = max(round(found["effective"]), 1)
+    said = f"its steps are worth {number} independent one{'s' if number > 1 else ''}"
+    if found["word"] != "cannot tell":
+        return said
+    few = found["effective"] < FEWEST
+    return f"{said}, {'too few to tell' if few else 'which do not show that σ is too small'}"
 
 
 def _of_lost(found: Found, quantity: str) -> str:

@@ -27,7 +27,7 @@ KEYS = {
     "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
     "suggested", "identified", "notes", "runs_of_step", "band95_of_step",
     "run_names", "lost_runs", "mistakes",
-    "fitted", "scale", "truth_sigma",
+    "fitted", "scale", "truth_sigma", "coverage", "bias", "correlation",
 }  # fmt: skip
 
 
@@ -92,6 +92,53 @@ def test_a_study_of_a_thousand_runs_takes_less_than_two_seconds():
     assert time.perf_counter() - start < 2
 
 
+def as_unit(e):
+    return e, np.broadcast_to(np.eye(e.shape[-1]), (*e.shape, e.shape[-1]))
+
+
+@pytest.mark.parametrize(("runs", "steps"), [(40, 20), (2, 400), (1, 800)])
+def test_a_correlation_that_p_lacks_is_named_though_nees_is_right(runs, steps):
+    e = np.random.default_rng(5).normal(size=(runs, steps, 3))
+    right = jaxslam.evaluate(*as_unit(e), names=["x", "y", "z"])
+    assert "correlate" not in str(right)
+    e[..., 2] = 0.8 * e[..., 0] + 0.6 * e[..., 2]
+    found = jaxslam.evaluate(*as_unit(e), names=["x", "y", "z"])
+    assert found.verdict["nees"] == pytest.approx(3, abs=0.3)
+    assert found.verdict["word"] in ("consistent", "cannot tell")
+    assert re.search(r"whitened errors of x and z correlate by 0\.(7|8)\d, more", str(found))
+    written = json.loads(json.dumps(found.asdict(), allow_nan=False))["correlation"]
+    assert (written["axes"], written["p"] < 1e-6) == (["x", "z"], True)
+    assert written["matrix"][0][2] == pytest.approx(0.8, abs=0.05)
+    assert jaxslam.evaluate(*as_unit(e[..., :1])).correlation is None
+
+
+def test_a_mean_error_is_named():
+    e, P = drawn(runs=40)
+    assert "mean error" not in str(jaxslam.evaluate(e, P))
+    e[..., 1] += 0.5 * np.sqrt(P[..., 1, 1])
+    found = jaxslam.evaluate(e, P, names=["x", "y", "z"])
+    assert re.search(
+        r"the mean error of y is 0\.[45]\d σ, more than chance \(p < 0\.0001\)", str(found)
+    )
+    assert found.asdict()["bias"]["y"]["p"] < 1e-6
+    assert evaluate_nees(found.nees, 3).asdict()["bias"] is None
+
+
+def test_coverage_shows_tails_that_a_mean_nees_does_not():
+    """Of Student's t with 4 degrees of freedom, of the right variance."""
+    rng = np.random.default_rng(0)
+    e = rng.normal(size=(50, 100, 3))
+    right = jaxslam.evaluate(*as_unit(e)).coverage
+    np.testing.assert_allclose([right["50"], right["90"], right["99"]], [0.5, 0.9, 0.99], atol=0.02)
+    found = jaxslam.evaluate(*as_unit(e * np.sqrt(2 / rng.chisquare(4, (50, 100, 1)))))
+    assert found.coverage["50"] > 0.6
+    assert found.coverage["99"] < 0.98
+    inside = f"{found.coverage['99']:.1%}"
+    assert re.search(
+        rf"^sets of 50, 90 and 99 % hold .* and {inside} of the errors$", str(found), re.M
+    )
+
+
 def test_units_that_differ_by_twenty_powers_of_ten_do_not_matter():
     e, P = drawn()
     scale = np.array([1e-10, 1.0, 1e10])
@@ -126,8 +173,12 @@ def test_one_run_of_white_innovations_is_as_many_samples_as_it_has_steps(factor,
     assert found.verdict["white"] > 0.01
     assert found.axis_verdict(0)["word"] == word
     assert "each step is one sample" in str(found)
-    # The same numbers as errors are one run, whose steps may be all but one.
-    assert jaxslam.evaluate(factor * e, P).verdict["word"] == "cannot tell"
+    # The same numbers as errors are one run, which shows only that σ is too small.
+    of_errors = jaxslam.evaluate(factor * e, P)
+    assert of_errors.verdict["word"] == (word if word == "over-confident" else "cannot tell")
+    steps = of_errors.verdict["effective"]
+    assert 600 < steps <= 800
+    assert f"its steps are worth {steps:.0f} independent ones" in str(of_errors)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.3])
@@ -179,6 +230,23 @@ def test_one_run_has_a_wide_interval():
     assert verdict["word"] == "over-confident"
     low, high = verdict["interval99"]
     assert 1 < low < 6 < high
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.9])
+def test_one_run_shows_that_sigma_is_too_small_by_all_its_steps(correlation):
+    """Of all axes, of each of them, and where NEES alone is known."""
+    e, P = autoregressive(2000, correlation)
+    root = np.array([[2.0, 0.0], [3.0, 0.5]])
+    found = jaxslam.evaluate(2 * e @ root.T, P @ (root @ root.T))
+    assert found.whitened is not None
+    np.testing.assert_allclose(found.whitened, 2 * e, rtol=1e-9)
+    alone = evaluate_nees(found.nees, 2)
+    for verdict in (found.verdict, found.axis_verdict(0), found.axis_verdict(1), alone.verdict):
+        assert (verdict["word"], verdict["samples"]) == ("over-confident", "effective")
+        low, high = verdict["interval99"]
+        assert 1 < low < 2 < high < 3
+    json.dumps(found.asdict(), allow_nan=False)
+    assert jaxslam.evaluate(e, P).verdict["word"] == "cannot tell"
 
 
 def test_steps_that_are_known_by_definition_are_left_out():
