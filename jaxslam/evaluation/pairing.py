@@ -208,7 +208,7 @@ def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndar
 
     Raises ValueError where it fills in none.
     """
-    without, zero = np.isnan(P).any(axis=(1, 2)), exactly_known(P)
+    without, zero = np.asarray(np.isnan(P).any(axis=(1, 2))), exactly_known(P)
     if zero[1:].any():
         without |= zero
     if without.all():

@@ -59,8 +59,8 @@ def _week_or_date(table: Table, expected: str) -> Float[np.ndarray, " n"]:
 
 
 def read_novatel(path: Path) -> Log | None:
-    """Lines of UTC, week, its second, and degrees, minutes, seconds of latitude and longitude, under
-    their titles; None of another file. Raises ValueError, naming the line."""
+    """Lines of UTC, week, its second, and degrees, minutes, seconds of latitude and longitude,
+    under their titles; None of another file. Raises ValueError, naming the line."""
     lines = text_lines(path, "trajectory")
     title = next(iter(lines), None)
     if title is None or not _NOVATEL.match(lines[title]):

@@ -74,7 +74,8 @@ def log(
 def in_seconds(
     table: Table, times: Float[np.ndarray, " n"], unit: str = ""
 ) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
-    """Times in seconds, of the `unit` that is said; or of the only one in which they are `STEPS` apart.
+    """Times in seconds, of the `unit` that is said, or of the only one in which they are `STEPS`
+    apart.
 
     Raises ValueError, naming the line, for a time that is none.
     """

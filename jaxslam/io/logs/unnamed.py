@@ -127,7 +127,7 @@ def _finite_or_none(table: Table, expected: str) -> Float[np.ndarray, "n k"]:
 
 def without_values(rows: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
     """A mask of the rows that have a time and NaN."""
-    return np.isnan(rows[:, 1:]).all(axis=1)
+    return np.asarray(np.isnan(rows[:, 1:]).all(axis=1))
 
 
 FORMATS: tuple[tuple[str, Reader], ...] = (
