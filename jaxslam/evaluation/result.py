@@ -32,7 +32,7 @@ from jaxslam.evaluation.inputs import (
     whitened,
     without_known,
 )
-from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
+from jaxslam.evaluation.sanity_checks import Logged, Mistake, gated, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
 from jaxslam.statistics import calibration
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep, exact_band
@@ -174,7 +174,8 @@ class Evaluation:
         numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
         factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
         runs = [_run(self, run) for run in range(self.runs)]
-        return mistakes(Logged(self.errors, self.sigmas, self.names, runs, numbers, factors))
+        found = mistakes(Logged(self.errors, self.sigmas, self.names, runs, numbers, factors))
+        return (*found, *gated(self.nees, self.dof)) if self.quantity == "NIS" else found
 
     @property
     def headline(self) -> str:
@@ -612,6 +613,11 @@ def advice(nis: Evaluation, nees: Evaluation | None = None) -> str:
     size = {"over-confident": "too small", "outlying": "too small", "under-confident": "too large"}
     if nis.mistakes or word not in (*size, "consistent"):
         return "innovations cannot tell what to turn; more steps or runs would"
+    if word == "under-confident" and nees is not None and nees.verdict["word"] == "consistent":
+        return (
+            "NIS is too small, but NEES of the same filter is right: these are no innovations of "
+            "it; log z − h(x) before the update, not after it, and H P Hᵀ + R with the P of then"
+        )
     if word == "consistent" and rho is None:
         return f"NIS is right and innovations are white: Q and R fit each other{_of_nees(nees)}"
     gain = "" if rho is None else f", and the gain too {'small' if rho > 0 else 'large'}"

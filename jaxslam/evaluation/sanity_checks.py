@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import chdtrc, chdtri
 
 from jaxslam._runtime.files import Json
 from jaxslam.statistics.bands import PerAxis, PerStep, shortfall_limit
@@ -34,6 +35,8 @@ _SHARE, _BELOW = 0.4, 5.0
 _NARROW = 5.0
 """The widest interval of a factor, upper by lower end, of an axis that may be an angle or not: that
 of 8 runs is narrower."""
+_FEWEST = 300
+"""The fewest NIS that show a gate."""
 _MANY = 300
 """The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
@@ -74,6 +77,29 @@ def mistakes(logged: Logged) -> tuple[Mistake, ...]:
     """Return all mistakes that are found."""
     kinds = [_is_angle(name) for name in logged.names]
     return (*_unwrapped(logged, kinds), *_degrees(logged, kinds), *_interchanged(logged))
+
+
+def gated(nis: PerStep, dof: int) -> Iterator[Mistake]:
+    """Find NIS that have passed a gate: none is beyond a usual quantile of χ², and the rest is as
+    it is below one.
+
+    Of so many that are scaled to have the median of χ², none is beyond their largest with a chance
+    of one in a million; and that is within 2 % of the gate.
+    """
+    x = nis[np.isfinite(nis)]
+    if len(x) < _FEWEST or (largest := float(x.max())) <= 0:
+        return
+    scale = float(np.median(x)) / chdtri(dof, 0.5)
+    alike = len(x) * np.log1p(-chdtrc(dof, largest / scale)) < np.log(1e-6) if scale > 0 else False
+    for share in (0.1, 0.05, 0.025, 0.01, 0.003, 0.001):
+        gate = chdtri(dof, share)
+        if alike and 0.98 * gate < largest <= gate * (1 + 1e-9):
+            yield Mistake(
+                "a gate in front of the NIS",
+                f"none of {len(x)} NIS is above {gate:.4g}, where {len(x) * share:.0f} should be: "
+                f"those beyond {1 - share:.1%} of χ² were not logged; log them before the gate",
+            )
+            return
 
 
 def withheld(found: Verdict) -> Verdict:
