@@ -3,6 +3,9 @@
 The library rosbags reads them by ROS' own definitions, so that nothing in a bag is run.
 """
 
+import shutil
+import sys
+import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,7 +45,8 @@ class Topic(NamedTuple):
 
 def is_bag(path: Path) -> bool:
     """Whether this is a bag by its name, or a folder with the metadata of one."""
-    return (path / "metadata.yaml").is_file() or path.suffix in (".bag", ".mcap", ".db3")
+    own = Path(path.stem) if path.suffix == ".zstd" else path
+    return (path / "metadata.yaml").is_file() or own.suffix in (".bag", ".mcap", ".db3")
 
 
 def bag_and_topic(place: str | Path) -> tuple[Path, str] | None:
@@ -99,11 +103,29 @@ def _opened(path: Path) -> Generator[tuple[Message, Callable[[bytes, str], Messa
     first = path.suffix == ".bag" and not path.is_dir()
     try:
         store = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
-        with (rosbag1 if first else rosbag2).Reader(path) as reader:
+        with _unpacked(path) as file, (rosbag1 if first else rosbag2).Reader(file) as reader:
             yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
     except Exception as error:  # of many kinds, as the library trusts its bytes
         told = one_line(error) or type(error).__name__
         raise ValueError(f"{path}: cannot be read ({told}); expected {BAG}, complete") from None
+
+
+@contextmanager
+def _unpacked(path: Path) -> Generator[Path]:
+    """The file of a bag that is compressed by itself, for as long as it is read."""
+    if path.suffix != ".zstd":
+        yield path
+        return
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / path.stem
+        with zstd.open(path, "rb") as packed, whole.open("wb") as file:
+            shutil.copyfileobj(packed, file)
+        yield whole
 
 
 def seconds(message: Message) -> float:
