@@ -292,7 +292,6 @@ class CovarianceText(NamedTuple):
     covariances: Float[np.ndarray, "n t t"]
     said: dict[str, str]
     """The words of its header that are of a `Convention`."""
-    notes: tuple[str, ...] = ()
 
     @property
     def convention(self) -> Convention:

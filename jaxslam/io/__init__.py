@@ -11,7 +11,8 @@ from jaxslam.io.tum import read_tum, write_tum
 _NAMES = {
     "source": ("Frame", "Source", "Trajectory"),
     "opening": ("open_source", "open_recording"),
-    "calibration": ("Calibration", "read_calibration", "write_calibration"),
+    "calibration": ("Calibration", "write_calibration"),
+    "lens_files": ("read_calibration",),
 }
 """Where each name is that is imported only when it is asked for."""
 __all__ = ["read_tum", "write_tum", *chain(*_NAMES.values())]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._runtime.files import Json, read_json, write_json
+from jaxslam._runtime.files import Json, write_json
 
 MODEL = "pinhole"
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -92,16 +92,6 @@ def from_field_of_view(width: int, height: int, degrees: float | None = None) ->
         width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
         sigma=(of_focal, of_focal, of_centre, of_centre), guessed=True,
     )  # fmt: skip
-
-
-def read_calibration(path: str | Path) -> Calibration:
-    """The calibration in a JSON file with model, width, height, fx, fy, cx, cy and distortion.
-
-    `sigma`, an object with fx, fy, cx, cy, and `guessed` may be there; further keys are ignored.
-    Raises `ValueError`, naming the file, where it is missing, is not JSON, or does not hold a
-    pinhole camera.
-    """
-    return read_json(path, "calibration", from_fields)
 
 
 def write_calibration(path: str | Path, calibration: Calibration, **further: Json) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import one_line
-from jaxslam.io.calibration import Calibration
+from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.recording import (
     Layout,
     Recording,
@@ -35,7 +35,7 @@ def _open(path: Path, _rate: float) -> Recording:
     times, names = read_timestamps(listing, NANOSECONDS, ",")
     files = listed(listing, camera / "data", names)
     yaml, truth = camera / "sensor.yaml", root / TRUTH / "data.csv"
-    calibration = fixed(read_sensor(yaml)) if yaml.is_file() else None
+    calibration = fixed(read_calibration(yaml)) if yaml.is_file() else None
     reference = _camera_truth(truth, yaml) if truth.is_file() and yaml.is_file() else None
     return of_files(path, files, times, calibration, reference)
 
@@ -43,22 +43,6 @@ def _open(path: Path, _rate: float) -> Recording:
 def _root(path: Path) -> Path:
     """The folder with `cam0`: `mav0`, or the one given."""
     return path / "mav0" if (path / "mav0").is_dir() else path
-
-
-def read_sensor(path: Path) -> Calibration:
-    """The calibration in a `sensor.yaml`: pinhole, radial-tangential. Raises ValueError."""
-    text = "\n".join(text_lines(path).values())
-    for key, expected in (("camera_model", "pinhole"), ("distortion_model", "radial-tangential")):
-        found = re.search(rf"^{key}:\s*([\w-]+)", text, re.MULTILINE)
-        if found and found[1] != expected:
-            raise ValueError(f"{path}: unknown {key} {found[1]!r}; expected {expected!r}")
-    width, height = _numbers(path, text, "resolution", 2)
-    try:
-        size, lens = (int(width), int(height)), _numbers(path, text, "intrinsics", 4)
-        distortion = tuple(_numbers(path, text, "distortion_coefficients", 4))
-        return Calibration(*size, *lens, distortion=distortion)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:

@@ -10,12 +10,12 @@ from jaxslam.io.calibration import (
     GUESSED_FIELD_OF_VIEW,
     Calibration,
     from_field_of_view,
-    read_calibration,
 )
 from jaxslam.io.camera import CAMERA
 from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
 from jaxslam.io.kitti import KITTI
+from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.recording import PLAIN, TIMESTAMPED, Layout, Recording
 from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
@@ -43,14 +43,14 @@ def open_source(
 ) -> Source:
     """The video at `path`, in the first of `LAYOUTS` that recognises it.
 
-    `calibration` (JSON), `fov` (horizontal field of view, degrees) and `reference` (TUM
-    trajectory) override what the layout holds; where nothing is known of the camera, its
-    calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain folder of
-    images. Every `every`-th frame is taken, from `start` seconds after the first on, at most
-    `frames` of them. Pictures and calibration are resized by the factor `scale`; by default those
-    of more than `WIDEST` pixels are reduced to a half, a third and so on, with a warning. Raises
-    `ValueError`, naming the file and line, for anything missing, unreadable or contradictory; the
-    first image is read here, later ones as the source is iterated over.
+    `calibration` (JSON, or of another program), `fov` (horizontal field of view, degrees) and
+    `reference` (TUM trajectory) override what the layout holds; where nothing is known of the
+    camera, its calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain
+    folder of images. Every `every`-th frame is taken, from `start` seconds after the first on, at
+    most `frames` of them. Pictures and calibration are resized by the factor `scale`; by default
+    those of more than `WIDEST` pixels are reduced to a half, a third and so on, with a warning.
+    Raises `ValueError`, naming the file and line, for anything missing, unreadable or
+    contradictory; the first image is read here, later ones as the source is iterated over.
     """
     if calibration and fov is not None:
         raise ValueError("give a calibration or a field of view, not both")
@@ -110,12 +110,26 @@ def _scale_for(name: str, width: int, height: int) -> float:
     return 1 / part
 
 
+def _of_pictures(name: str, camera: Calibration, width: int, height: int) -> Calibration:
+    """A calibration at the size of the pictures, where theirs is the same shape."""
+    if (camera.width, camera.height) == (width, height) or (
+        camera.width * height != camera.height * width
+    ):
+        return camera
+    warnings.warn(
+        f"{name} is for {camera.width}x{camera.height}: it is taken to be of the same pictures "
+        f"before they were resized to {width}x{height}",
+        stacklevel=3,
+    )
+    return camera.resized(width, height)
+
+
 def _calibration(
     recording: Recording, width: int, height: int, file: str | Path | None, fov: float | None
 ) -> Calibration:
     """The user's, or the layout's, or a guess."""
     if file:
-        return read_calibration(file)
+        return _of_pictures(str(file), read_calibration(file), width, height)
     if fov is not None:
         return from_field_of_view(width, height, fov)
     if recording.calibration is not None:

@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import LARGEST
-from jaxslam.io.calibration import Calibration, read_calibration
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.lens_files import read_calibration
+from jaxslam.io.logs.log import UNITS, unit_of
 from jaxslam.io.source import Image, Trajectory
 from jaxslam.io.text import numbers, text_lines
 from jaxslam.io.tum import not_rigid, read_tum
 
+SINCE_1970 = 1e8
+"""A name that is as large a number, or larger, may be a time."""
 IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
 Calibrator = Callable[[int, int], Calibration]
@@ -119,7 +124,19 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _open_plain(path: Path, rate: float) -> Recording:
     files = image_files(path)
-    return of_files(path, files, np.arange(len(files)) / rate)
+    times = _times_of_names(files)
+    if times is not None:
+        warnings.warn(f"{path}: the names of the pictures are taken as their times", stacklevel=2)
+    return of_files(path, files, np.arange(len(files)) / rate if times is None else times)
+
+
+def _times_of_names(files: Sequence[Path]) -> Float[np.ndarray, " n"] | None:
+    """The names as times since 1970, in s or a part of it; None where they are none."""
+    told = numbers([file.stem for file in files], len(files))
+    if told is None or len(files) < 2 or min(told) < SINCE_1970 or not (np.diff(told) > 0).all():
+        return None
+    unit = unit_of(np.array(told))
+    return None if unit is None else np.array(told) * UNITS[unit]
 
 
 def fixed(calibration: Calibration) -> Calibrator:

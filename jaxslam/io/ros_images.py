@@ -1,5 +1,6 @@
 """The pictures of a topic of a ROS bag, and the lens in the `camera_info` beside it."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.lens_files import plumb_bob
 from jaxslam.io.recording import Calibrator, Layout, Recording, check_increasing, decoded
 from jaxslam.io.ros import BAG, Message, Topic, bag_and_topic, chosen, messages, seconds
 from jaxslam.io.source import Image
@@ -25,13 +27,20 @@ _ACCEPTED = f"{', '.join(_GREY)} of 8 or 16 bits"
 def _open(path: Path, _rate: float) -> Recording:
     bag, named = bag_and_topic(path) or (path, "")
     topic = chosen(bag, named, IMAGES, "--topic")
-    times = np.array([seconds(message) for message in messages(topic)])
-    check_increasing(f"{topic}, message", range(len(times)), times)
+    stamps = np.array([seconds(message) for message in messages(topic)])
+    new = np.diff(stamps, prepend=-np.inf) != 0
+    if new.mean() < 0.5:  # never stamped
+        new[:] = True
+    if not new.all():
+        told = f"{(~new).sum()} of {len(new)} pictures have the stamp of the one before"
+        warnings.warn(f"{topic}: {told}, and are left out", stacklevel=2)
+    check_increasing(f"{topic}, message", np.flatnonzero(new).tolist(), stamps[new])
 
     def images() -> Iterator[Image]:
-        return (as_image(f"{topic}, message {i}", x) for i, x in enumerate(messages(topic)))
+        told = (x for x in enumerate(messages(topic)) if new[x[0]])
+        return (as_image(f"{topic}, message {i}", x) for i, x in told)
 
-    return Recording(f"{topic}", times, images, _calibrator(topic))
+    return Recording(f"{topic}", stamps[new], images, _calibrator(topic))
 
 
 def as_image(place: str, message: Message) -> Image:
@@ -59,7 +68,8 @@ def as_image(place: str, message: Message) -> Image:
 def _calibrator(topic: Topic) -> Calibrator | None:
     """The lens in the first `camera_info` beside the pictures: K and D, or P if they are rectified.
 
-    None where K is zero: not calibrated. Another distortion is refused when it is asked for.
+    That is of the whole sensor, of which pixels may be binned. None where K is zero: not
+    calibrated. Another distortion is refused when it is asked for.
     """
     camera, _, last = topic.name.removesuffix("/compressed").rpartition("/")
     beside = Topic(topic.parent, f"{camera}/camera_info", "sensor_msgs/msg/CameraInfo")
@@ -69,15 +79,13 @@ def _calibrator(topic: Topic) -> Calibrator | None:
         return None
 
     def lens(_width: int, _height: int) -> Calibration:
-        rectified, model = "rect" in last, info.distortion_model
-        if not rectified and model != "plumb_bob":
-            raise ValueError(
-                f"{beside}: unknown distortion {model!r}; expected plumb_bob, or give --calibration"
-            )
-        distortion = () if rectified else tuple(D)
+        rectified = "rect" in last
         matrix = (P if rectified else K).reshape(3, -1)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        binned = [max(int(getattr(info, f"binning_{axis}")), 1) for axis in "xy"]
         try:
-            return Calibration(info.width, info.height, *matrix, distortion=distortion)
+            distortion = () if rectified else plumb_bob(info.distortion_model, D.tolist())
+            whole = Calibration(info.width, info.height, *matrix, distortion=distortion)
+            return whole.resized(info.width // binned[0], info.height // binned[1])
         except ValueError as error:
             raise ValueError(f"{beside}: {error}") from None
 

@@ -88,7 +88,7 @@ class Tracker:
         if not isinstance(self.calibration, Calibration):
             raise ValueError(
                 f"calibration must be a Calibration, not a {type(self.calibration).__name__}; "
-                "jaxslam.io.calibration.read_calibration reads one from a file"
+                "jaxslam.io.read_calibration reads one from a file"
             )
         settings, own = self.settings, self.filter
         self.filter_name = settings.filter if own is None else type(own).__name__

@@ -48,7 +48,7 @@ from jaxslam.evaluation import (
     evaluate_poses,
     read_covariances,
 )
-from jaxslam.io.calibration import read_calibration
+from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.opening import open_source
 from jaxslam.io.tum import read_tum
 from jaxslam.simulation.scenario import parse_override

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from jaxslam.cli import main
 from jaxslam.io.board import Board, View, sharpness
 from jaxslam.io.calibrate import calibrate, covered, different, drawn_coverage
-from jaxslam.io.calibration import Calibration, read_calibration
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.lens_files import read_calibration
 from jaxslam.tracking.synthetic import add_noise
 
 CAMERA = Calibration(480, 360, 430.0, 428.0, 233.0, 184.0)

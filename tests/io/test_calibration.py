@@ -8,9 +8,9 @@ import pytest
 from jaxslam.io.calibration import (
     Calibration,
     from_field_of_view,
-    read_calibration,
     write_calibration,
 )
+from jaxslam.io.lens_files import read_calibration
 
 GOOD = {
     "model": "pinhole",
@@ -156,3 +156,81 @@ def test_other_files_are_refused(tmp_path, text, words):
         path.write_text(text)
     with pytest.raises(ValueError, match=words):
         read_calibration(path)
+
+
+LENS = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, (0.1, -0.2, 0.01, 0.02))
+FOLDED = "[525.0, 0.,\n     308.5, 0., 524.0, 236.5, 0., 0., 1.]"
+K = "[525.0, 0, 308.5, 0, 524.0, 236.5, 0, 0, 1]"
+OTHERS = {
+    "opencv.yaml": f"""%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {FOLDED}
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   data: [ 0.1, -0.2, 0.01, 0.02, 0. ]
+""",
+    "ros.yaml": f"""image_width: 640
+image_height: 480
+camera_name: cam  # and what it is for
+camera_matrix:
+  data: {K}
+distortion_model: plumb_bob
+distortion_coefficients:
+  data: [0.1, -0.2, 0.01, 0.02, 0]
+""",
+    "camchain.yaml": """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.1, -0.2, 0.01, 0.02]
+  distortion_model: radtan
+  intrinsics: [525.0, 524.0, 308.5, 236.5]
+  resolution: [640, 480]
+cam1:
+  intrinsics: [1.0, 1.0, 1.0, 1.0]
+""",
+    "orb.yaml": """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: 525.0
+Camera.fy: 524.0
+Camera.cx: 308.5
+Camera.cy: 236.5
+Camera.k1: 0.1
+Camera.k2: -0.2
+Camera.p1: 0.01
+Camera.p2: 0.02
+Camera.width: 640
+Camera.height: 480
+""",
+    "cameras.txt": "# CAMERA_ID\n1 OPENCV 640 480 525 524 309.0 237.0 0.1 -0.2 0.01 0.02\n",
+    "other.json": """{"image_width": 640, "image_height": 480,
+ "dist_coeff": [[0.1, -0.2, 0.01, 0.02]],
+ "camera_matrix": [[525.0, 0, 308.5], [0, 524.0, 236.5], [0, 0, 1]]}""",
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_files_of_other_programs_are_read(tmp_path, name):
+    (tmp_path / name).write_text(OTHERS[name])
+    assert read_calibration(tmp_path / name) == LENS
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("camchain.yaml", "radtan", "equidistant", "unknown distortion_model 'equidistant' of 4"),
+        ("camchain.yaml", "pinhole", "omni", "unknown camera_model 'omni'"),
+        ("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0.3]", "of 8 numbers; expected plumb_bob"),
+        ("ros.yaml", "image_width: 640\n", "", "has no image size or no camera matrix; its keys"),
+        ("cameras.txt", "OPENCV", "OPENCV_FISHEYE", "unknown camera model OPENCV_FISHEYE of 10"),
+    ],
+)
+def test_another_lens_of_another_program_is_refused(tmp_path, name, old, new, words):
+    (tmp_path / name).write_text(OTHERS[name].replace(old, new))
+    with pytest.raises(ValueError, match=words):
+        read_calibration(tmp_path / name)

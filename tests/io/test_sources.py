@@ -57,8 +57,8 @@ def empty(folder):
 YAML = "mav0/cam0/sensor.yaml"
 REFUSED = [
     (euroc, instead(YAML, "radial-tangential", "equidistant"), "distortion_model 'equidistant'"),
-    (euroc, instead(YAML, "61.5, ", ""), r"sensor\.yaml: intrinsics: \[4 finite numbers\] is miss"),
-    (euroc, instead(YAML, "60.5", "nan"), r"intrinsics: \[4 finite numbers\] is missing"),
+    (euroc, instead(YAML, "61.5, ", ""), r"sensor\.yaml: has no image size or no camera matrix"),
+    (euroc, instead(YAML, "60.5", "nan"), r"sensor\.yaml: fx must be finite, not nan"),
     (euroc, instead(YAML, "60.5", "-60.5"), r"sensor\.yaml: fx must be positive, not -60\.5"),
     (euroc, without_a_picture, r"data\.csv names \d+\.png, but .* is missing"),
     (kitti, put("times.txt", "0\n0.1\n"), r"times\.txt has 2 lines for 3 images"),

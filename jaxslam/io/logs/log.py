@@ -87,13 +87,18 @@ def in_seconds(
     try:
         check_seconds(str(table.path), times)
     except ValueError:
-        step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-        fit = [x for x, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
-        if len(fit) != 1:
+        unit = unit_of(times) or ""
+        if not unit:
             raise
-        note = f"{table.path}: times are taken as {fit[0]}, {step * UNITS[fit[0]]:.3g} s apart"
-        return times * UNITS[fit[0]], (note,)
+        return times * UNITS[unit], (f"{table.path}: times are taken as {unit}",)
     return times, ()
+
+
+def unit_of(times: Float[np.ndarray, " n"]) -> str | None:
+    """The only unit of time in which they are `STEPS` apart; None where there is none, or two."""
+    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    fit = [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+    return fit[0] if len(fit) == 1 else None
 
 
 def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:

@@ -1,0 +1,152 @@
+"""A camera's calibration in the files of other programs: YAML of OpenCV, ROS, Kalibr, EuRoC and
+ORB-SLAM, JSON of any of their keys, and COLMAP's `cameras.txt`."""
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.io.calibration import INTRINSICS, Calibration, from_fields
+from jaxslam.io.text import numbers, text_lines
+
+PINHOLES = ("pinhole", "PinHole", "")
+PLUMB_BOB = ("plumb_bob", "radtan", "radial-tangential", "opencv", "none", "")
+"""What programs call OpenCV's k1, k2, p1, p2, k3."""
+_SIZE = (("width", "image_width", "Camera.width"), ("height", "image_height", "Camera.height"))
+_MATRIX = ("camera_matrix.data", "camera_matrix", "K.data", "K", "intrinsics", "Camera")
+_DISTORTION = (
+    "distortion_coefficients.data", "distortion_coefficients", "distortion_coeffs",
+    "dist_coeff.data", "dist_coeff", "dist_coeffs", "D.data", "D", "distortion",
+)  # fmt: skip
+_COLMAP: dict[str, Callable[..., tuple[float, ...]]] = {
+    "SIMPLE_PINHOLE": lambda f, x, y: (f, f, x, y),
+    "PINHOLE": lambda *four: four,
+    "SIMPLE_RADIAL": lambda f, x, y, k: (f, f, x, y, k),
+    "RADIAL": lambda f, x, y, k1, k2: (f, f, x, y, k1, k2),
+    "OPENCV": lambda *eight: eight,
+}
+"""fx, fy, cx, cy and the distortion by the parameters of COLMAP's models."""
+ACCEPTED = (
+    "JSON with model, width, height, fx, fy, cx, cy, distortion; YAML of OpenCV, ROS, Kalibr, "
+    "EuRoC or ORB-SLAM; or COLMAP's cameras.txt"
+)
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """The calibration in a JSON file as `write_calibration` writes it, or of another program.
+
+    Raises `ValueError`, naming the file, where it is missing, or holds no pinhole camera with
+    OpenCV's distortion.
+    """
+    lines = list(text_lines(path, "calibration").values())
+    try:
+        if lines and lines[0].lstrip().startswith(("{", "[")):
+            fields = json.loads("\n".join(lines))
+            plain = not isinstance(fields, dict) or "fx" in fields or "model" in fields
+            return from_fields(fields) if plain else of_keys(_flat(fields))
+        if any(re.fullmatch(r"\d+ [A-Z_]+( [-+.\deE]+)+", line) for line in lines):
+            return _of_colmap(lines)
+        return of_keys(_of_yaml(Path(path).read_text(encoding="utf-8-sig")))
+    except ValueError as error:
+        told = f"not a JSON file ({error})" if isinstance(error, json.JSONDecodeError) else error
+        raise ValueError(f"{path}: {told}; expected {ACCEPTED}") from None
+
+
+def of_keys(fields: dict[str, object]) -> Calibration:
+    """The calibration of the keys that programs use. Raises ValueError for what is no pinhole."""
+    model = str(fields.get("camera_model", fields.get("Camera.type", "")))
+    if model not in PINHOLES:
+        raise ValueError(f"unknown camera_model {model!r}; expected 'pinhole'")
+    size = _values(fields.get("resolution"))
+    if len(size) != 2:
+        size = [x for names in _SIZE for x in _first(fields, names)]
+    lens = _first(fields, _MATRIX) or _values([fields.get(f"Camera.{x}") for x in INTRINSICS])
+    lens = [lens[i] for i in (0, 4, 2, 5)] if len(lens) == 9 else lens
+    if len(size) != 2 or len(lens) != 4:
+        told = ", ".join(list(fields)[:12]) or "none"
+        raise ValueError(f"has no image size or no camera matrix; its keys are {told}")
+    distortion = _first(fields, _DISTORTION)
+    if not distortion and "Camera.k1" in fields:
+        names = ("k1", "k2", "p1", "p2", "k3")
+        distortion = _values([fields.get(f"Camera.{x}", 0) for x in names])
+    distortion = plumb_bob(str(fields.get("distortion_model", "")), distortion)
+    return Calibration(int(size[0]), int(size[1]), *lens, distortion=distortion)
+
+
+def plumb_bob(model: str, distortion: Sequence[float]) -> tuple[float, ...]:
+    """OpenCV's k1, k2, p1, p2, k3 of a distortion. Raises ValueError for one that has more.
+
+    A rational polynomial whose other numbers are zero is this one too.
+    """
+    others = [float(x) for x in distortion[5:]]
+    known = (*PLUMB_BOB, "rational_polynomial") if not any(others) else PLUMB_BOB
+    if model not in known or any(others):
+        raise ValueError(
+            f"unknown distortion_model {model!r} of {len(distortion)} numbers; expected plumb_bob "
+            "(radtan), k1, k2, p1, p2, k3; undistort the pictures, or calibrate anew "
+            "(jaxslam calibrate)"
+        )
+    return tuple(float(x) for x in distortion[:5])
+
+
+def _of_colmap(lines: Sequence[str]) -> Calibration:
+    """The first camera; its pixels begin at the corner of the first one, ours in its middle."""
+    name, *told = next(line.split()[1:] for line in lines if line[0].isdigit())
+    values = numbers(told, len(told)) or []
+    try:
+        fx, fy, cx, cy, *distortion = _COLMAP[name](*values[2:])
+    except (KeyError, TypeError, ValueError):
+        known = ", ".join(_COLMAP)
+        raise ValueError(
+            f"unknown camera model {name} of {len(told)} numbers; known: {known}"
+        ) from None
+    size = int(values[0]), int(values[1])
+    return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=tuple(distortion))
+
+
+def _of_yaml(text: str) -> dict[str, object]:
+    """The keys, of nested ones joined by dots, and their numbers, lists or words; what such files
+    have of YAML, and the first of several cameras."""
+    text = re.sub(r"\[([^\]]*)\]", lambda x: "[" + " ".join(x[1].split()) + "]", text)
+    fields: dict[str, object] = {}
+    above: list[tuple[int, str]] = []
+    for line in text.splitlines():
+        found = re.fullmatch(r"(\s*)([\w./-]+)\s*:(?:\s+(.*?))?\s*(?:#.*)?", line)
+        if found is None:
+            continue
+        indent, key, value = len(found[1]), found[2], re.sub(r"^!!\S+", "", found[3] or "").strip()
+        above = [x for x in above if x[0] < indent]
+        if value:
+            names = [name for _, name in above if not re.fullmatch(r"cam\d+", name)]
+            fields.setdefault(".".join([*names, key]), value.strip("\"'"))
+        else:
+            above.append((indent, key))
+            continue
+    return fields
+
+
+def _flat(fields: dict[str, object], before: str = "") -> dict[str, object]:
+    result: dict[str, object] = {}
+    for key, value in fields.items():
+        if isinstance(value, dict):
+            result |= _flat(value, f"{before}{key}.")
+        else:
+            result[f"{before}{key}"] = value
+    return result
+
+
+def _first(fields: dict[str, object], names: Sequence[str]) -> list[float]:
+    return next((found for name in names if (found := _values(fields.get(name)))), [])
+
+
+def _values(told: object) -> list[float]:
+    """The numbers of a word, or of a list of any depth; none of anything else."""
+    if isinstance(told, str):
+        words = told.strip("[]").replace(",", " ").split()
+        return numbers(words, len(words)) or []
+    try:
+        return np.asarray(told, float).ravel().tolist() if told is not None else []
+    except (ValueError, TypeError):
+        return []
