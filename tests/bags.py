@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
+STORES[1].register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+)
 KINDS = ("run.bag", "run.mcap", "run.db3", "run")
 """Names of a bag of ROS 1, single files of ROS 2 and its folder."""
 EPOCH = 1_700_000_000
@@ -54,13 +57,16 @@ class Ros:
     def pose_stamped(self, t, T, frame="map"):
         return self.make("geometry_msgs/PoseStamped", self.header(t, frame), self.pose(T))
 
-    def transform_stamped(self, t, T, frame="map"):
+    def transform_stamped(self, t, T, frame="map", body="base_link"):
         p, q = self.parts(T)
         moved = self.make("geometry_msgs/Vector3", *p)
         turned = self.make("geometry_msgs/Quaternion", *q)
         transform = self.make("geometry_msgs/Transform", moved, turned)
         header = self.header(t, frame)
-        return self.make("geometry_msgs/TransformStamped", header, "base_link", transform)
+        return self.make("geometry_msgs/TransformStamped", header, body, transform)
+
+    def transforms(self, *stamped):
+        return self.make("tf2_msgs/TFMessage", list(stamped))
 
     def path(self, times, poses, frame="map"):
         stamped = [self.pose_stamped(t, T, frame) for t, T in zip(times, poses, strict=True)]

@@ -12,6 +12,7 @@ import verdicts as benchmark
 from bags import EPOCH, KINDS, ros_of, write_bag
 from cases import quick_jit
 from scipy import stats
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import jaxslam
@@ -234,17 +235,17 @@ def tum_and(values):
     return write
 
 
-def states(cameras):
-    """OpenVINS's `t q p v bg ba dt cameras …`."""
+def states(cameras, imu=(0, 0)):
+    """OpenVINS's `t q p v bg ba dt cameras …`, and so many numbers and σ of the `imu`."""
 
     def write(folder):
-        more = np.zeros((STEPS, 9 + 1 + 1 + 15 * cameras))
+        more = np.zeros((STEPS, 9 + 1 + 1 + 15 * cameras + imu[0]))
         more[:, 10] = cameras
         header = "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot ...\n"
         for name, T in (("estimate", ESTIMATE), ("groundtruth", TRUTH)):
             state = TIMES, quaternions(T[:, :3, :3]), T[:, :3, 3], more
             lines(folder / f"state_{name}.txt", *state, header=header)
-        spread = np.zeros((STEPS, 9 + 1 + 1 + 14 * cameras))
+        spread = np.zeros((STEPS, 9 + 1 + 1 + 14 * cameras + imu[1]))
         spread[:, 10] = cameras
         sigma = SIGMA[:, 3:], SIGMA[:, :3], spread
         lines(folder / "state_deviation.txt", TIMES, *sigma, header="# timestamp(s) q p v …\n")
@@ -281,6 +282,137 @@ def of_planes(values):
     return write
 
 
+def columns(T):
+    """The numbers of TUM's lines, by their titles."""
+    numbers = TIMES, *T[:, :3, 3].T, *quaternions(T[:, :3, :3]).T
+    return dict(zip(("t", "x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True))
+
+
+def rewritten(line, encoding="utf-8", title=None):
+    """TUM's files, each line of numbers as `line` makes it of its place and its words; before the
+    first one what `title` makes of the count of its words."""
+
+    def write(folder):
+        tum(folder)
+        for path in folder.iterdir():
+            told, *rows = path.read_text().splitlines()
+            words = [row.split() for row in rows]
+            above = [] if title is None else [title(len(words[0]))]
+            written = (line(i, row) for i, row in enumerate(words))
+            path.write_text("\n".join([told, *above, *written]) + "\n", encoding=encoding)
+
+    return write
+
+
+def trajectories(titles, said="", between=",", nanoseconds=False, ending="csv"):
+    """Estimate and truth with these of TUM's columns, or numbers, and a line above them."""
+
+    def write(folder):
+        tum(folder)
+        for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
+            (folder / f"{name}.txt").unlink()
+            held = columns(T)
+            held["t"] = 1e9 * TIMES if nanoseconds else TIMES
+            told = (held.get(x, np.full(STEPS, 0.25)) for x in titles.split())
+            lines(folder / f"{name}.{ending}", *told, header=said, between=between)
+
+    return write
+
+
+def of_cnspy(kind, blocks):
+    """One file with the kind of its errors in every line, and the truth."""
+
+    def write(folder):
+        pairs = ("xx", "xy", "xz", "yy", "yz", "zz"), ("rr", "rp", "ry", "pp", "py", "yy")
+        axes = ",".join([f"p{x}" for x in pairs[0]] + [f"q{x}" for x in pairs[1]])
+        told = np.column_stack([*columns(ESTIMATE).values(), *(x[:, *UPPER3] for x in blocks)])
+        rows = [",".join([kind, *(f"{x:.17g}" for x in row)]) for row in told]
+        titles = f"est_err_type,t,tx,ty,tz,qx,qy,qz,qw,{axes}"
+        (folder / "estimate.csv").write_text("\n".join([titles, *rows]) + "\n")
+        write_tum(folder / "truth.txt", TIMES, TRUTH)
+
+    return write
+
+
+def square(folder):
+    """SQUARE's headers, poses and lower triangles; of errors along the body, rotation first."""
+    write_tum(folder / "reference.tum", TIMES, TRUTH)
+    headers = {
+        "FORMAT": "SQUARE/0.3", "TIMESTAMP_UNIT": "milliseconds",
+        "TANGENT_CONVENTION": "right_perturbation", "TANGENT_ORDER": "rotation_translation",
+    }  # fmt: skip
+    above = "".join(f"#%{key} {value}\n" for key, value in headers.items())
+    _, *pose = columns(ESTIMATE).values()
+    lower = right_rotation_first(P)[:, *np.tril_indices(6)]
+    lines(folder / "estimate.smfeval", 1e3 * TIMES, *pose, lower, header=above)
+
+
+ENU_SIGMA = np.array([0.3, 0.2, 0.5])
+ENU_CORRELATION = np.array([[1, 0.4, -0.2], [0.4, 1, 0.3], [-0.2, 0.3, 1]])
+ENU_P = ENU_CORRELATION * np.outer(ENU_SIGMA, ENU_SIGMA)
+ENU_ERRORS = RNG.normal(size=(STEPS, 3)) @ np.linalg.cholesky(ENU_P).T
+
+
+def on_earth(folder):
+    """RTKLIB's solution at 22° south, and NovAtel's truth in degrees, minutes and seconds."""
+    seconds = 455342.0 + np.arange(STEPS)
+    zero = np.zeros(STEPS)
+    latitude, longitude, height = -22.3 - 1e-4 * np.arange(STEPS), zero + 114.2, zero + 5
+    square, of_pole = 0.00669437999014, np.sin(np.radians(latitude)) ** 2
+    across = 6378137.0 / np.sqrt(1 - square * of_pole)
+    along = across * (1 - square) / (1 - square * of_pole)
+    east, north, up = -ENU_ERRORS.T
+    own = [
+        latitude + np.degrees(north / (along + height)),
+        longitude + np.degrees(east / (across + height) / np.cos(np.radians(latitude))),
+        height + up,
+    ]
+    order = [(1, 1), (0, 0), (2, 2), (0, 1), (0, 2), (1, 2)]
+    roots = [np.sign(ENU_P[x]) * np.sqrt(abs(ENU_P[x])) + zero for x in order]
+    titles = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m)"
+    week = zero + 2158
+    lines(
+        folder / "estimate.pos",
+        *(week, seconds, *own, zero, zero, *roots),
+        header=f"% program : RTKPOST\n% GPST {titles} sdun(m)\n",
+    )
+    parts = []
+    for angle in (latitude, longitude):
+        whole, minutes = np.trunc(angle), 60 * np.abs(angle - np.trunc(angle))
+        parts += [whole, np.trunc(minutes), 60 * (minutes - np.trunc(minutes))]
+    titles = "UTCTime Week GPSTime Latitude Longitude H-Ell\n"
+    lines(folder / "truth.txt", seconds, week, seconds, *parts, height, header=titles)
+
+
+def graph(folder):
+    """Vertices of g2o, in any order, among other lines."""
+    tum(folder)
+    for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
+        (folder / f"{name}.txt").unlink()
+        _, *pose = columns(T).values()
+        rows = [" ".join(f"{x:.17g}" for x in row) for row in np.column_stack(pose)]
+        vertices = [f"VERTEX_SE3:QUAT {i} {row}" for i, row in enumerate(rows)]
+        told = ["FIX 0", "EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1", *vertices[9:], *vertices[:9]]
+        (folder / f"{name}.g2o").write_text("\n".join(told) + "\n")
+    upper = P[:, *UPPER]
+    lines(folder / "covariance.txt", np.arange(STEPS), upper, header=HEADER)
+
+
+OTHER = TRUTH @ np.linalg.inv(ESTIMATE) @ TRUTH
+
+
+def two_beside_one_truth(folder):
+    """Runs that are files of their own covariances, of one flight."""
+    write_tum(folder / "ref.txt", TIMES, TRUTH)
+    for name, T in (("a", ESTIMATE), ("b", OTHER)):
+        pose = T[:, :3, 3], quaternions(T[:, :3, :3])
+        lines(folder / f"{name}.txt", TIMES, *pose, *MIXED_BLOCKS)
+
+
+def mat(**arrays: Any):
+    return lambda folder: savemat(folder / "runs.mat", arrays)
+
+
 def npz(**arrays: Any):
     def write(folder):
         np.savez(folder / "runs.npz", **arrays)
@@ -302,13 +434,24 @@ def bag(name, estimate="odometry", truth="pose_stamped"):
         r, covariances = ros_of(name), in_the_world(P)
         told = [getattr(r, estimate)(*x) for x in zip(TIMES, ESTIMATE, covariances, strict=True)]
         if truth == "path":  # published as it grows: the last one is the whole
-            true = [r.path(TIMES[:n], TRUTH[:n]) for n in (1, 10, STEPS)]
+            true = {"/mocap": [r.path(TIMES[:n], TRUTH[:n]) for n in (1, 10, STEPS)]}
+        elif truth == "transforms":
+            true = joined(r)
         else:
             zero = [np.zeros((6, 6))] * (truth not in ("pose_stamped", "transform_stamped"))
-            true = [getattr(r, truth)(*x, *zero) for x in zip(TIMES, TRUTH, strict=True)]
-        write_bag(folder / name, {"/filter/pose": told, "/mocap": true})
+            told_true = zip(TIMES, TRUTH, strict=True)
+            true = {"/mocap": [getattr(r, truth)(*x, *zero) for x in told_true]}
+        write_bag(folder / name, {"/filter/pose": told, **true})
 
     return write
+
+
+def joined(r):
+    """The truth as transforms of a tree: a body that moves, and where on it the sensor is fixed."""
+    fixed = np.linalg.inv(TRUTH[3])
+    moving = [r.transform_stamped(t, T @ fixed) for t, T in zip(TIMES, TRUTH, strict=True)]
+    sensor = r.transform_stamped(0.0, TRUTH[3], "base_link", "imu")
+    return {"/tf": [r.transforms(x) for x in moving], "/tf_static": [r.transforms(sensor)]}
 
 
 class Log(NamedTuple):
@@ -322,6 +465,8 @@ class Log(NamedTuple):
     rtol: float = 1e-4
     convention: Convention | None = None
     """Where it is not that of the arrays."""
+    spare: bool = False
+    """Whether the last numbers of lines are not read."""
 
     def evaluated(self, folder: Path, *_) -> Evaluation:
         options: dict[str, Any] = {
@@ -350,8 +495,8 @@ def of_n(n, header=""):
     return csv_log(wanted, PLACES, e.reshape(len(PLACES), -1), triangles, header=header)
 
 
-def of_bag(name, *kinds, **truth):
-    topics = {"estimate": "/filter/pose", "truth": "/mocap"}
+def of_bag(name, *kinds, topic="/mocap", **truth):
+    topics = {"estimate": "/filter/pose", "truth": topic}
     write = bag(name, *kinds, **truth)
     return Log(write, source=name, beside=topics, rtol=1e-9, convention=SPLIT)
 
@@ -386,6 +531,84 @@ LOGS = {
     "poses of OpenVINS, one file": Log(
         poses_with_covariances, source="estimate.txt", beside={"truth": "truth.txt"}
     ),
+    "states of OpenVINS with an IMU's intrinsics": Log(states(1, imu=(30, 28)), OF_SIGMAS),
+    "TUM, UTF-8 mark": Log(rewritten(lambda _, row: " ".join(row), "utf-8-sig")),
+    "TUM, UTF-16": Log(rewritten(lambda _, row: " ".join(row), "utf-16")),
+    "TUM, decimal commas": Log(rewritten(lambda _, row: ";".join(row).replace(".", ","))),
+    "TUM, decimal commas and spaces": Log(
+        rewritten(lambda _, row: " ".join(row).replace(".", ","))
+    ),
+    "TUM, tabs": Log(rewritten(lambda _, row: "\t".join(row))),
+    "TUM, quotes": Log(rewritten(lambda _, row: ",".join(f'"{x}"' for x in row))),
+    "TUM, a comma at the end": Log(rewritten(lambda _, row: ",".join(row) + ",")),
+    "TUM, an index of pandas": Log(
+        rewritten(
+            lambda i, row: ",".join([str(i), *row]),
+            title=lambda count: "".join(f",{i}" for i in "abcdefghijklmnopqrstuv"[:count]),
+        )
+    ),
+    "TUM, one .csv": Log(
+        trajectories("t x y z qx qy qz qw", between=" "),
+        source="estimate.csv",
+        beside={"covariance": "covariance.txt", "truth": "truth.csv"},
+    ),
+    "TUM, w first and nanoseconds": Log(
+        trajectories("t x y z qw qx qy qz", between=",", nanoseconds=True)
+    ),
+    "titles in another order": Log(
+        trajectories(
+            "qw qz qx qy z status y x t",
+            "q_w,q_z,q_x,q_y,pos_z [m],status,pos_y [m],pos_x [m],timestamp [s]\n",
+        )
+    ),
+    "titles of ROS' CSV": Log(
+        trajectories(
+            "seq x y z qx qy qz qw t",
+            "%seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+            "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,"
+            "field.pose.orientation.w,field.header.stamp\n",
+            nanoseconds=True,
+        )
+    ),
+    "titles of EuRoC": Log(
+        trajectories(
+            "t x y z qw qx qy qz v v v",
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+            "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]\n",
+            nanoseconds=True,
+        ),
+        spare=True,
+    ),
+    **{
+        f"w first, {count} numbers": Log(
+            trajectories("t x y z qw qx qy qz" + " v" * (count - 8), between=" "),
+            spare=True,
+        )
+        for count in (11, 17)
+    },
+    "cnspy, split": Log(of_cnspy("type5", (P[:, :3, :3], P[:, 3:, 3:]))),
+    # To the first order of the errors.
+    "cnspy, right": Log(
+        of_cnspy("type1", (right_rotation_first(P)[:, 3:, 3:], right_rotation_first(P)[:, :3, :3])),
+        rtol=0.02,
+        convention=Convention("right"),
+    ),
+    "SQUARE": Log(square, rtol=0.02, convention=Convention("right", order="rotation-first")),
+    "RTKLIB and NovAtel": Log(
+        on_earth,
+        partial(jaxslam.evaluate, ENU_ERRORS[None], np.tile(ENU_P, (1, STEPS, 1, 1)), names="xyz"),
+        convention=Convention("split", "body"),
+    ),
+    "g2o": Log(graph),
+    "TUM, column by column": Log(tum_and(P[:, *np.tril_indices(6)])),
+    "runs beside one truth": Log(
+        two_beside_one_truth,
+        partial(
+            evaluate_poses,
+            *(np.array([ESTIMATE, OTHER]), np.array([P, P]), np.array([TRUTH, TRUTH])),
+            Convention(**MIXED),
+        ),
+    ),
     "KITTI": Log(kitti(timed=False)),
     "KITTI, timed": Log(kitti(timed=True)),
     "plane, triangle": Log(of_planes(FLAT_P[:, *UPPER3]), IN_THE_PLANE),
@@ -396,6 +619,16 @@ LOGS = {
     "npz of GTSAM's marginals": npz_log(IN_SPACE, **MARGINALS)._replace(
         rtol=0.02, convention=Convention("right", order="rotation-first")
     ),
+    "mat of poses": Log(mat(**POSES), IN_SPACE, "runs.mat"),
+    **{
+        f"mat of errors, {kind} of names": Log(
+            mat(errors=ERRORS, covariances=COVARIANCES, names=names),
+            partial(OF_ERRORS, names="abcd"),
+            "runs.mat",
+        )
+        for kind, names in (("letters", [*"abcd"]), ("cells", np.array([*"abcd"], object)))
+    },
+    "mat of NEES": Log(mat(nees=NEES, dof=4), NEES_OF, "runs.mat"),
     "npz of errors": npz_log(OF_ERRORS, errors=ERRORS, covariances=COVARIANCES),
     "npz of σ": npz_log(OF_DEVIATIONS, errors=ERRORS, sigmas=DEVIATIONS),
     "npz of innovations": npz_log(
@@ -436,4 +669,8 @@ LOGS = {
     "bag: PoseWithCovarianceStamped as truth": of_bag(
         "run.bag", truth="pose_with_covariance_stamped"
     ),
+    **{
+        f"bag: transforms of {name}": of_bag(name, truth="transforms", topic="/tf:map.imu")
+        for name in ("run.bag", "run.mcap")
+    },
 }

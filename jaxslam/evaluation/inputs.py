@@ -422,6 +422,8 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
             f"{path}: cannot be read ({one_line(error)}); expected a mat file"
         ) from None
     arrays = {name: value for name, value in found.items() if not name.startswith("__")}
+    for name in {"names", *CHOICES} & arrays.keys():  # cells, or a matrix of letters
+        arrays[name] = np.array([str(np.ravel(x)[0]).strip() for x in arrays[name].ravel()])
     if "dof" in arrays and arrays["dof"].size == 1:
         arrays["dof"] = arrays["dof"].ravel()
     return {name: value.ravel() if name == "times" else value for name, value in arrays.items()}

@@ -24,6 +24,7 @@ Message: TypeAlias = Any
 BAG = "a ROS bag (.bag; .mcap, .db3, or the folder with metadata.yaml)"
 WITH_COVARIANCE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_OF_TF = "geometry_msgs/TransformStamped[] transforms"
 POSES = (
     *WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Path",
@@ -97,12 +98,14 @@ def _opened(path: Path) -> Generator[tuple[Message, Callable[[bytes, str], Messa
     """The library's reader, and what makes a message of bytes and a type. Raises ValueError."""
     try:
         from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise missing(f"{path}: a ROS bag needs", "ros", error) from None
     first = path.suffix == ".bag" and not path.is_dir()
     try:
         store = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
+        if first:  # whose types there are without those of tf
+            store.register(get_types_from_msg(_OF_TF, TRANSFORMS))
         with _unpacked(path) as file, (rosbag1 if first else rosbag2).Reader(file) as reader:
             yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
     except Exception as error:  # of many kinds, as the library trusts its bytes

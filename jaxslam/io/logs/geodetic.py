@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
-from jaxslam.io.text import Table, text_lines
+from jaxslam.io.text import Table, numbers, text_lines
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """Of WGS 84: the radius, m."""
@@ -32,13 +32,13 @@ def read_rtklib(table: Table) -> Log | None:
     None of another table. Raises ValueError, naming the line."""
     if not any(" ".join(_RTKLIB.split()[:3]) in " ".join(line.split()) for line in table.comments):
         return None
-    expected = f"a time of GPS in two cells, and {_RTKLIB}"
+    expected = f"finite numbers: a time of GPS in two cells, and {_RTKLIB}"
     if table.rows.shape[1] < 13:
         raise ValueError(f"{table.place(0)}: expected {expected}")
     times = _week_or_date(table, expected)
-    numbers = table.numbers(expected, range(2, 13))
-    latitude, longitude, height = numbers[:, 0], numbers[:, 1], numbers[:, 2]
-    n, e, u, ne, eu, un = numbers[:, 5:].T
+    told = table.numbers(expected, range(2, 13))
+    latitude, longitude, height = told[:, 0], told[:, 1], told[:, 2]
+    n, e, u, ne, eu, un = told[:, 5:].T
     roots = np.column_stack([e, n, u, ne, eu, un])
     places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     P = symmetric(np.sign(roots) * roots**2, places)
@@ -67,13 +67,13 @@ def read_novatel(path: Path) -> Log | None:
         return None
     rows = []
     for number, line in list(lines.items())[1:]:
-        found = re.findall(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?", line)
         if line.startswith("("):  # units
             continue
-        if len(found) < 10:
-            expected = "UTC, week, second, D M S of latitude and of longitude, and the height"
+        row = numbers(line.split()[:10], 10)
+        if row is None:
+            expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
             raise ValueError(f"{path}, line {number}: expected {expected}")
-        rows.append([float(x) for x in found[:10]])
+        rows.append(row)
     values = np.array(rows)
     north, east = (_degrees(values[:, k : k + 3]) for k in (3, 6))
     times = GPS_EPOCH + WEEK * values[:, 1] + values[:, 2]

@@ -67,6 +67,9 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if covariances is None else covariances
+    wrong = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
+    if wrong.size:
+        raise ValueError(f"{table.place(wrong[0])}: expected a covariance of finite numbers")
     times, notes = in_seconds(table, times, unit)
     return Log(times, T, P, said, notes, oriented=oriented)
 
@@ -74,8 +77,7 @@ def log(
 def in_seconds(
     table: Table, times: Float[np.ndarray, " n"], unit: str = ""
 ) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
-    """Times in seconds, of the `unit` that is said, or of the only one in which they are `STEPS`
-    apart.
+    """Times in seconds, of the `unit` that is said, or the only one where they are `STEPS` apart.
 
     Raises ValueError, naming the line, for a time that is none.
     """
