@@ -90,11 +90,11 @@ def evaluate_poses(
     together with its covariance was not logged, and one whose truth is all NaN is not compared.
     `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a run together, (runs,
     6 steps, 6 steps), of the errors that the `convention` names. Where the estimate is of another
-    world, `align` it by `yaw` (and position), `se3` or `sim3`: at the first pose, if its σ is small,
-    else to all positions. The covariance is transported with it. Given
-    the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
-    tested beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
-    ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured
+    world, `align` it by `yaw` (and position), `se3` or `sim3`: at the first pose, if its σ is
+    small, else to all positions. The covariance is transported with it. Given the scale of the
+    world, or with `sim3`, NEES is at one scale a run, and the drift of scale is tested beside it.
+    Of a robot that moves in a plane `axes_used` are those that it estimates, as ("x", "y", "rz");
+    by default all whose errors are not zero throughout. A truth that is measured
     has a `truth_sigma`, of position (m) and orientation (degrees), along the axes of the body,
     which is added to the covariances. Whether another convention would make the data consistent is
     tried too. Raises ValueError, naming run and step.
