@@ -1,8 +1,8 @@
 """The causes of a wrong NEES that lie between the logs, not in the filter.
 
 Quaternions with w first, a constant rotation and lever arm between the bodies, two worlds, an
-alignment of what the filter observes, half angles, runs that are the same. Each is found only
-beyond doubt, with a number and the NEES without it; then there is no verdict.
+alignment of what the filter observes, half angles, runs that are the same. Each is named only
+on strong evidence, with a number and the NEES without it; then there is no verdict.
 """
 
 from __future__ import annotations

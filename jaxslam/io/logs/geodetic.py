@@ -17,7 +17,7 @@ from jaxslam.io.logs.log import Log, symmetric
 from jaxslam.io.text import Table, text_lines
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
-"""Of WGS 84: the radius, m."""
+"""The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
 GPS_EPOCH = 315964800.0
 """Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
 WEEK = 604800.0
@@ -59,8 +59,8 @@ def _week_or_date(table: Table, expected: str) -> Float[np.ndarray, " n"]:
 
 
 def read_novatel(path: Path) -> Log | None:
-    """Lines of UTC, week, its second, and degrees, minutes, seconds of latitude and longitude, under
-    their titles; None of another file. Raises ValueError, naming the line."""
+    """Lines of UTC, week, its second, and degrees, minutes, seconds of latitude and longitude,
+    under their titles; None of another file. Raises ValueError, naming the line."""
     lines = text_lines(path, "trajectory")
     title = next(iter(lines), None)
     if title is None or not _NOVATEL.match(lines[title]):
