@@ -35,18 +35,20 @@ class EvaluateOptions:
     state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run, or
     trajectories with their covariances beside one truth.txt. Runs may differ in length."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Covariances of the trajectory's poses (docs/covariance-format.md)."""
+    """Covariances of the trajectory's poses (docs/covariance-format.md). Default: those in its own
+    lines."""
     truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None
-    """True trajectory in TUM format; for a folder, the truth of all runs. For a bag: its topic, or
-    BAG:TOPIC of another bag; default: the only topic that fits."""
+    """True trajectory of any of these formats; for a folder, the truth of all runs. For a bag: its
+    topic, or BAG:TOPIC of another bag; default: the only topic that fits."""
     estimate: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Topic of a bag with the estimated poses and covariances. Default: the only one that fits."""
     error: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which error the covariance describes: right (T = est Exp(e)), left (T = Exp(e) est) or split
     (position and rotation separately). Default: what the file says, otherwise right."""
     axes: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Axes of that error: body, world, or mixed (position along the world's axes, rotation about
-    the body's). Default: body for right, world for left and split."""
+    """Axes of that error: body, world, mixed (position along the world's axes, rotation about the
+    body's) or rpy (position along the world's, and roll, pitch and yaw). Default: body for right,
+    world for left and split."""
     order: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Order of its components: position-first or rotation-first. Default: what the file says,
     otherwise position-first."""

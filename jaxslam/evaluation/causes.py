@@ -1,8 +1,8 @@
 """The causes of a wrong NEES that lie between the logs, not in the filter.
 
 Quaternions with w first, a constant rotation and lever arm between the bodies, two worlds, an
-alignment of what the filter observes, half angles, runs that are the same. Each is found only
-beyond doubt, with a number and the NEES without it; then there is no verdict.
+alignment of what the filter observes, half angles, runs that are the same. Each is named only
+on strong evidence, with a number and the NEES without it; then there is no verdict.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.evaluation.alignment import aligned, similarity
+from jaxslam.evaluation.alignment import aligned, gauge_directions, similarity
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
@@ -25,6 +25,8 @@ Compared = Callable[[Poses, str, Sequence[str]], Evaluation]
 """The evaluation of poses with an alignment, along some axes, or as stated with none."""
 ROUNDS = 8
 """Alignments, and fits of the mounting, in turn."""
+UNDETERMINED = 0.05
+"""The share of the largest singular value below which motion does not determine a direction."""
 LESS = 3.0
 """The factor by which a constant that is fitted lessens the errors that it explains."""
 MANY = 10
@@ -227,9 +229,28 @@ def _fitted(
         step = np.eye(n + 1)
         step[:n, :n] = _mean_rotation(between[:, :n, :n])
         if lever:
-            step[:n, n] = between[:, :n, n].mean(axis=0)
+            step[:n, n] = _lever_arm(world, align)
         X = step @ X
     return X
+
+
+def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
+    """The arm l of `p = p̂ + R̂ l` by least squares of positions, whose alignment goes with it.
+
+    Zero along directions that the rotations do not determine.
+    """
+    n = world.estimates.shape[-1] - 1
+    rows = []
+    for estimates, truths, there in zip(world.estimates, world.truths, world.logged, strict=True):
+        T, off = estimates[there], (truths - estimates)[there, :n, n]
+        own = np.column_stack([T[:, :n, :n].reshape(-1, n), off.ravel()])
+        if align != "none":
+            T[:, :n, n] -= T[:, :n, n].mean(axis=0)
+            U = gauge_directions(T, align)[:, :n].reshape(len(own), -1)
+            own -= U @ np.linalg.lstsq(U, own)[0]
+        rows.append(own)
+    both = np.concatenate(rows)
+    return np.linalg.lstsq(both[:, :n], both[:, n], rcond=UNDETERMINED)[0]
 
 
 def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
@@ -244,7 +265,7 @@ def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
         for T in (poses.estimates, poses.truths)
     )
     left, singular, right = np.linalg.svd(own.T @ true)
-    if singular[1] < 0.05 * singular[0]:
+    if singular[1] < UNDETERMINED * singular[0]:
         return np.eye(3)
     return left * [1.0, 1.0, np.sign(np.linalg.det(left @ right))] @ right
 

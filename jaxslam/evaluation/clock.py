@@ -31,7 +31,7 @@ class Offset(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether it is beyond doubt."""
+        """Whether it is larger than chance."""
         return abs(self.seconds) > max(BEYOND * self.sigma, 1e-4)
 
 

@@ -10,7 +10,7 @@ are the errors. To first order right and split are the same but for the axes; le
 adjoint of T̂. Every error may then be written along other axes, turned by R̂: `body`, `world` (ROS:
 split, world) or `mixed`, the position along the world's and the rotation about the body's (MSCKF,
 error-state filters: split, mixed; GTSAM: right, body, rotation-first). With `rpy` the rotation is
-of roll, pitch and yaw, `R = Rz(yaw) Ry(pitch) Rx(roll)` (robot_localization: split, rpy). A
+of roll, pitch and yaw, `R = Rz(yaw) Ry(pitch) Rx(roll)` (`robot_localization`: split, rpy). A
 covariance is `marginal`, or `given` the scale of the world, of which its filter then knows nothing.
 
 All matrices that change one into another have determinant one: a wrong convention keeps

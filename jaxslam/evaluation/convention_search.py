@@ -94,8 +94,8 @@ class Identification:
     whole: bool = False
     """Whether all axes together are: position or rotation alone may not be."""
     better: tuple[Convention, int, int] | None = None
-    """Where none makes the data consistent, the one that fits better than the stated one beyond
-    doubt, in how many runs, and of how many."""
+    """Where none makes the data consistent, the one that certainly fits better than the stated
+    one, in how many runs, and of how many."""
 
     @property
     def convention(self) -> Convention | None:

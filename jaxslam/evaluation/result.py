@@ -102,7 +102,7 @@ class Evaluation:
     convention: Convention | None = None
     """The convention of the covariances, where they are of poses."""
     alignment: str = "none"
-    """The alignment of the estimates to the truth: `none`, `se3` or `sim3`."""
+    """The alignment of the estimates to the truth: `none`, `yaw`, `se3` or `sim3`."""
     identified: Identification | None = None
     """The convention that would make the data consistent, where it was searched for."""
     notes: tuple[str, ...] = ()

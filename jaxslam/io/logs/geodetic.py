@@ -17,7 +17,7 @@ from jaxslam.io.logs.log import Log, symmetric
 from jaxslam.io.text import Table, numbers, text_lines
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
-"""Of WGS 84: the radius, m."""
+"""The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
 GPS_EPOCH = 315964800.0
 """Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
 WEEK = 604800.0

@@ -14,7 +14,7 @@ from jaxslam.io.tum import of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 STEPS = (1e-3, 10.0)
-"""The time from a pose to the next, s, by which the unit of times is told."""
+"""The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
 """The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
 _LATEST = 1e11
@@ -32,7 +32,7 @@ class Log(NamedTuple):
     poses: Float[np.ndarray, "n d d"]
     """Matrices (n, 4, 4), or (n, 3, 3) in the plane; NaN where the log has none."""
     covariances: Float[np.ndarray, "m t t"]
-    """One a pose, NaN where the log has none; or none at all."""
+    """One for every pose, NaN where the log has none; or none at all."""
     said: Mapping[str, str] = NOTHING
     """The words of a `Convention` that the format, or the log, is known by."""
     notes: tuple[str, ...] = ()
