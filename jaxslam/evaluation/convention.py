@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED
+from jaxslam.io.logs.log import MIXED, in_seconds
 from jaxslam.io.logs.unnamed import is_deviations, without_values
 from jaxslam.io.text import read_table
 from jaxslam.io.tum import write_table
@@ -328,6 +328,11 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     `ValueError`, naming the file, for a line of other numbers, or that are not finite, and for a
     word of the header that is not known.
     """
+    return covariances_of_file(path, t)[0]
+
+
+def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, tuple[str, ...]]:
+    """The same, and remarks on what was made of the file."""
     triangle = t * (t + 1) // 2
     kinds = {
         1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
@@ -337,7 +342,8 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     table = read_table(path, "covariances", "covariances", kinds[1 + triangle])
     count, of_names, rows = table.rows.shape[1], named.read(table), table.rows
     if of_names is not None and len(of_names.covariances):
-        return CovarianceText(of_names.times, of_names.covariances, dict(of_names.said))
+        told = CovarianceText(of_names.times, of_names.covariances, dict(of_names.said))
+        return told, of_names.notes
     deviations = t == 6 and is_deviations(rows)
     expected = kinds.get(count, kinds[1 + triangle])
     if deviations:
@@ -350,18 +356,20 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
         said = {**(MIXED if deviations else {}), **_said(" ".join(table.comments))}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    P, notes = np.full((len(rows), t, t), np.nan), ()
+    P = np.full((len(rows), t, t), np.nan)
+    times, notes = in_seconds(table, rows[:, 0])
     if deviations or count == 1 + t:
         sigma = rows[there][:, [4, 5, 6, 1, 2, 3] if deviations else range(1, 1 + t)]
         P[there] = _squared(path, sigma)[:, :, None] * np.eye(t)
     elif count == 1 + t * t:
         P[there] = rows[there, 1:].reshape(-1, t, t)
     else:
-        P[there], notes = _of_triangle(path, rows[there, 1:], t)
+        P[there], more = _of_triangle(path, rows[there, 1:], t)
+        notes += more
     unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
     names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
-    return CovarianceText(rows[:, 0], scale[:, None] * P * scale, said, notes)
+    return CovarianceText(times, scale[:, None] * P * scale, said), notes
 
 
 def _of_triangle(

@@ -19,8 +19,8 @@ from jaxslam.evaluation.convention import (
     Convention,
     CovarianceText,
     converted,
+    covariances_of_file,
     geometry_of,
-    read_covariances,
 )
 from jaxslam.evaluation.inputs import exactly_known, without_unknown
 from jaxslam.evaluation.tracked_frames import EvaluatedPoses, evaluated_poses
@@ -108,10 +108,12 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     if run.covariance == run.estimate:
         if not len(log.covariances):
             raise ValueError(f"{run.estimate} has no covariances; give them by --covariance FILE")
-        text = CovarianceText(log.times, log.covariances, dict(log.said))
+        text, notes = CovarianceText(log.times, log.covariances, dict(log.said)), ()
     else:
-        text = read_covariances(Path(str(run.covariance)), geometry_of(log.poses).tangent_dim)
-        text = _stamped_by(log.times, text)
+        dimension = geometry_of(log.poses).tangent_dim
+        text, notes = covariances_of_file(Path(str(run.covariance)), dimension)
+        text, rounded = _stamped_by(log.times, text)
+        notes += rounded
         _check_times(run.covariance, text.times)
     P, used = _nearest(run, log.times, text)
     if isinstance(run.covariance, ros.Topic):
@@ -119,7 +121,7 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     there = ~np.isnan(log.poses[:, 0, 0])
     left_out = _counted("poses of the estimate are NaN", ~there)
     log, P = log._replace(times=log.times[there], poses=log.poses[there]), P[there]
-    notes = [*log.notes, *truth.notes, *text.notes, *_other_frames(log, truth)]
+    notes = [*log.notes, *truth.notes, *notes, *_other_frames(log, truth)]
     oriented, told = _oriented(log, truth)
     notes += told
     raw, times = log, log.times
@@ -174,15 +176,17 @@ def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
         )
 
 
-def _stamped_by(times: Float[np.ndarray, " n"], text: CovarianceText) -> CovarianceText:
+def _stamped_by(
+    times: Float[np.ndarray, " n"], text: CovarianceText
+) -> tuple[CovarianceText, tuple[str, ...]]:
     """With the stamps of the estimate, line by line, where its own are those rounded."""
     if len(times) != len(text.times) or len(np.unique(text.times)) == len(times):
-        return text
+        return text, ()
     digits = np.diff(np.unique(text.times)).min(initial=np.inf)
     if not np.isfinite(digits) or np.abs(times - text.times).max() > digits:
-        return text
+        return text, ()
     note = f"times of covariances are rounded to {digits:.3g} s: they are taken line by line"
-    return text._replace(times=times, notes=(*text.notes, note))
+    return text._replace(times=times), (note,)
 
 
 def _nearest(
