@@ -13,14 +13,7 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
 
-from jaxslam.statistics.bands import (
-    Mask,
-    PerAxis,
-    PerStep,
-    PowerSums,
-    chi2_quantile,
-    mean_p_value,
-)
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep, chi2_quantile
 from jaxslam.statistics.one_run import effective_samples
 
 SETS = (0.5, 0.9, 0.99)
@@ -30,6 +23,9 @@ FEW_RUNS = 3
 NOTICEABLE = 0.3
 """The least correlation that fewer runs show: parts of the errors of two axes that never change
 along a run, of a share f of the variance, correlate by about f in it."""
+
+_TINY = 1e-150
+"""In place of zero below a fraction bar."""
 
 
 class Bias(NamedTuple):
@@ -64,15 +60,15 @@ def coverage(nees: PerStep, dof: int, logged: Mask) -> tuple[float, ...]:
 def bias(normalised: PerAxis, logged: Mask) -> Bias:
     """The mean of errors over their σ, and its p for each axis alone.
 
-    From three runs on p is that of the scatter of their means (Student's t without skewness). The
-    mean of fewer has at most the variance 1/runs, as if each run had one error all along: p is that
-    of a Gaussian with this variance, and assumes that σ is right.
+    From three runs on p is that of the scatter of their means (Student's t). The mean of fewer has
+    at most the variance 1/runs, as if each run had one error all along: p is that of a Gaussian
+    with this variance, and assumes that σ is right.
     """
     means = _of_runs(normalised, logged)
     mean = np.mean(means, axis=0)
     if len(means) < FEW_RUNS:
         return Bias(mean, scipy.special.erfc(np.abs(mean) * math.sqrt(len(means) / 2)))
-    return Bias(mean, np.array([_p_of_zero(each) for each in means.T]))
+    return Bias(mean, _p_of_zero(means))
 
 
 def correlation(whitened: PerAxis, logged: Mask) -> Correlation:
@@ -83,8 +79,8 @@ def correlation(whitened: PerAxis, logged: Mask) -> Correlation:
     the number of pairs of axes.
     """
     z = np.where(logged[..., None], whitened, 0.0)
-    z = z / np.maximum(np.max(np.abs(z), axis=(0, 1)), np.finfo(float).tiny)
-    z = z / np.maximum(np.sqrt(np.sum(z**2, axis=(0, 1)) / np.sum(logged)), np.finfo(float).tiny)
+    z = z / np.maximum(np.max(np.abs(z), axis=(0, 1)), _TINY)
+    z = z / np.maximum(np.sqrt(np.sum(z**2, axis=(0, 1)) / np.sum(logged)), _TINY)
     matrix = np.einsum("rsi,rsj->ij", z, z) / np.sum(logged)
     first, second = np.triu_indices(len(matrix), 1)
     if not len(first):
@@ -97,8 +93,7 @@ def correlation(whitened: PerAxis, logged: Mask) -> Correlation:
         away = np.abs(np.arctanh(r)) * np.sqrt(samples)
         p = np.where(np.abs(r) < NOTICEABLE, 1.0, scipy.special.erfc(away / math.sqrt(2)))
     else:
-        products = _of_runs(z[..., first] * z[..., second], logged)
-        p = np.array([_p_of_zero(each) for each in products.T])
+        p = _p_of_zero(_of_runs(z[..., first] * z[..., second], logged))
     best = int(np.lexsort((-np.abs(r), p))[0])
     axes = int(first[best]), int(second[best])
     return Correlation(matrix, axes, min(1.0, len(p) * float(p[best])))
@@ -109,7 +104,9 @@ def _of_runs(values: PerAxis, logged: Mask) -> Float[np.ndarray, "runs n"]:
     return np.mean(values, axis=1, where=logged[..., None])
 
 
-def _p_of_zero(means: Float[np.ndarray, " runs"]) -> float:
-    """The p of a mean of zero, of numbers whose powers do not overflow."""
-    largest = float(np.max(np.abs(means)))
-    return mean_p_value(PowerSums.of(means / largest), 0.0) if largest else 1.0
+def _p_of_zero(values: Float[np.ndarray, "runs k"]) -> Float[np.ndarray, " k"]:
+    """The two-sided p of Student's t for means of zero; 1 where all values are zero."""
+    values = values / np.maximum(np.max(np.abs(values), axis=0), _TINY)
+    error = np.std(values, axis=0, ddof=1) / math.sqrt(len(values))
+    t = np.abs(np.mean(values, axis=0)) / np.maximum(error, _TINY)
+    return 2 * scipy.special.stdtr(len(values) - 1, -t)
