@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy.special import chdtr, chdtrc, chdtri, gammaincinv
 
 from jaxslam._runtime.files import LARGEST, one_line, read_arrays
 from jaxslam._runtime.lookup import suggestion
@@ -138,8 +138,10 @@ def of_one_dof(
         return np.where(there, values, np.nan), int(dof[there][0]), ()
     one = int(np.median(dof[there]))
     result = np.full_like(values, np.nan)
-    above, below = chdtrc(dof[there], values[there]), chdtr(dof[there], values[there])
-    alike = np.where(above < 0.5, chdtri(one, above), 2 * gammaincinv(one / 2, below))
+    chi2 = scipy.special
+    above = chi2.chdtrc(dof[there], values[there])
+    below = chi2.chdtr(dof[there], values[there])
+    alike = np.where(above < 0.5, chi2.chdtri(one, above), 2 * chi2.gammaincinv(one / 2, below))
     in_proportion = values[there] * one / dof[there]
     result[there] = np.where(above > 1e-300, alike, in_proportion)
     note = (

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Bool, Float
-from scipy.special import chdtrc, chdtri
 
 from jaxslam._runtime.files import Json
 from jaxslam.statistics.bands import PerAxis, PerStep, shortfall_limit
@@ -87,13 +87,13 @@ def gated(nis: PerStep, dof: int) -> Iterator[Mistake]:
     of one in a million; and that is within 2 % of the gate.
     """
     x = nis[np.isfinite(nis)]
-    if len(x) < _FEWEST or (largest := float(x.max())) <= 0:
+    if len(x) < _FEWEST or (middle := float(np.median(x))) <= 0:
         return
-    scale = float(np.median(x)) / chdtri(dof, 0.5)
-    alike = len(x) * np.log1p(-chdtrc(dof, largest / scale)) < np.log(1e-6) if scale > 0 else False
+    largest, scale = float(x.max()), middle / scipy.special.chdtri(dof, 0.5)
+    none_beyond = len(x) * np.log1p(-scipy.special.chdtrc(dof, largest / scale))
     for share in (0.1, 0.05, 0.025, 0.01, 0.003, 0.001):
-        gate = chdtri(dof, share)
-        if alike and 0.98 * gate < largest <= gate * (1 + 1e-9):
+        gate = scipy.special.chdtri(dof, share)
+        if none_beyond < np.log(1e-6) and 0.98 * gate < largest <= gate * (1 + 1e-9):
             yield Mistake(
                 "a gate in front of the NIS",
                 f"none of {len(x)} NIS is above {gate:.4g}, where {len(x) * share:.0f} should be: "
