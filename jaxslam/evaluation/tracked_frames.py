@@ -10,8 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
+from jaxslam.io.text import read_table, text_lines
 
 FRAMES = "frames.csv"
+_COLUMNS = ("time", "state", "map", "unit_fixed")
+_FRAME = "a finite time, a state, the number of a map, and unit_fixed 0 or 1"
 
 
 class FrameLog(NamedTuple):
@@ -75,33 +78,21 @@ def read_frames(path: Path) -> FrameLog | None:
     Raises ValueError, naming the line, for what a tracker does not write.
     """
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
+        first = next(iter(text_lines(path, comments=True).values()), "")
+    except ValueError:  # there is none, or it is no text
         return None
-    titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
-    if not {"time", "state", "map", "unit_fixed"} <= set(titles):
+    if not set(_COLUMNS) <= {title.strip() for title in first.split(",")}:
         return None
-    table = [
-        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
-        for number, row in enumerate(rows, start=2)
-        if row != [""]
-    ]
-    if not table:
-        raise ValueError(f"{path} has no frames")
-    return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))
-
-
-def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
-    """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
-    try:
-        time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
-        if np.isfinite(time) and 0 <= number <= 1_000_000 and fixed in ("0", "1"):
-            return time, told["state"] == "lost", number, fixed == "1"
-    except (ValueError, KeyError):
-        pass
-    raise ValueError(
-        f"{place}: expected a finite time, a state, the number of a map, and unit_fixed 0 or 1"
-    )
+    table = read_table(path, "log", "frames", _FRAME)
+    time, state, number, fixed = (table.titles.index(name) for name in _COLUMNS)
+    rows = table.rows
+    there = np.isfinite(rows[:, time]) & (rows[:, number] % 1 == 0) & (rows[:, number] >= 0)
+    there &= (rows[:, number] <= 1e6) & np.isin(rows[:, fixed], (0, 1))
+    if not there.all():
+        raise ValueError(f"{table.place(np.argmin(there))}: expected {_FRAME}")
+    words = table.words.get(state, ("",) * len(rows))
+    lost = np.array([word == "lost" for word in words])
+    return FrameLog(rows[:, time], lost, rows[:, number].astype(int), rows[:, fixed] == 1)
 
 
 def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
