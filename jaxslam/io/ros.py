@@ -71,7 +71,7 @@ def chosen(bag: Path, named: str, types: Sequence[str], option: str, other: str 
     name, _, frames = own.partition(":")
     for x in held:
         if x.type == TRANSFORMS and x.name.strip("/") == name and types == POSES:
-            return x._replace(name=f"{x.name}:{frames}")
+            return x._replace(name=f"{x.name}:{frames}".rstrip(":"))
     fit = [x for x in held if x.type in types and held[x] and x.name.strip("/") != other]
     fit = [x for x in fit if not own or x.name.strip("/") == own]
     if len(fit) == 1:
