@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,7 +56,7 @@ class RealLog:
 
 
 @contextmanager
-def runs_of(folder: Path, leave_out: tuple[str, ...]) -> Iterator[Path]:
+def runs_of(folder: Path, leave_out: tuple[str, ...]) -> Generator[Path]:
     """The folder, or one of links to its files but for those that are left out."""
     if not leave_out:
         yield folder

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from jaxslam.io.logs.log import Log, log, symmetric
 from jaxslam.io.text import Table
 
@@ -37,7 +35,7 @@ def read(table: Table) -> Log | None:
                 f"{table.path}: the header {key} is {value}; expected {' or '.join(values)}"
             )
         said[key] = values[value]
-    P = symmetric(table.rows[:, 8:], list(zip(*np.tril_indices(6), strict=True)))
+    P = symmetric(table.rows[:, 8:], [(i, j) for i in range(6) for j in range(i + 1)])
     convention = {"error": said["TANGENT_CONVENTION"], "order": said["TANGENT_ORDER"]}
     found = table.rows[:, 0], table.rows[:, 1:4], table.rows[:, 4:8], P
     result = log(table, *found, convention, said["TIMESTAMP_UNIT"])
