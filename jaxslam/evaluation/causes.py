@@ -80,6 +80,8 @@ def _rms(values: np.ndarray) -> float:
 
 def _repeated(poses: Poses) -> Iterator[Mistake]:
     """Runs, said to be independent, with the same rows: their poses are equal to the last digit."""
+    if len(poses.logged) < 2:
+        return
     rows = [
         {pose.tobytes() for pose in run[logged]}
         for run, logged in zip(poses.estimates, poses.logged, strict=True)

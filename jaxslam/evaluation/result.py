@@ -262,6 +262,13 @@ class Evaluation:
 
     def axis_verdict(self, axis: int) -> Verdict:
         """The verdict on one axis alone, of one degree of freedom."""
+        return self._axis_verdicts[axis]
+
+    @cached_property
+    def _axis_verdicts(self) -> tuple[Verdict, ...]:
+        return tuple(self._of_axis(axis) for axis in range(len(self.names)))
+
+    def _of_axis(self, axis: int) -> Verdict:
         with np.errstate(over="ignore"):
             normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
             nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
