@@ -186,7 +186,10 @@ def converted(
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Return J of `ξ_new = J ξ_old`, to first order."""
-    return from_right(new, poses) @ np.linalg.inv(from_right(old, poses))
+    M = from_right(old, poses)
+    # Blocks of rotations, but for the adjoint of left errors and the rates of angles.
+    orthogonal = old.error != "left" and old.axes != "rpy"
+    return from_right(new, poses) @ (np.swapaxes(M, -1, -2) if orthogonal else np.linalg.inv(M))
 
 
 def turning(convention: Convention, estimates: Matrices) -> Squares:

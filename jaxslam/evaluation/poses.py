@@ -38,7 +38,7 @@ from jaxslam.evaluation.inputs import (
     whitened,
     without_known,
 )
-from jaxslam.evaluation.result import Evaluation
+from jaxslam.evaluation.result import Evaluation, described
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
@@ -119,7 +119,7 @@ def evaluate_poses(
     if not told and identified.doubtful and not identified.stands:
         told = (Mistake("the convention of the covariances is another", identified.sentence),)
     how = {"times": at, "timed": times is not None, "identified": identified}
-    return replace(found, causes=told, **how)
+    return described(found, causes=told, **how)
 
 
 def as_stated(
