@@ -20,12 +20,13 @@ from jaxslam.evaluation.convention import (
     Axes,
     Convention,
     Matrices,
+    blocks,
     change,
     converted,
     geometry_of,
     lever,
 )
-from jaxslam.evaluation.inputs import Poses, exactly_known
+from jaxslam.evaluation.inputs import MOST, Poses, exactly_known
 
 ALIGNMENTS = ("none", "yaw", "se3", "sim3")
 MAX_TIME_DIFFERENCE = 0.01
@@ -182,13 +183,49 @@ def projected(
     are then taken as independent of each other's, or the joint one of all. With W = (VᵀU)⁻¹ the
     k-th block of `Q P Qᵀ` is `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
+    if covariances.ndim == 3:
+        return _projected_by_blocks(T_wc, covariances, convention, align, line)
     U = gauge_directions(T_wc, align)
     V = _fitted(U, line)
-    P, VP, VPV = _in_split(T_wc, covariances, convention, V)
+    count, t = U.shape[:2]
+    P = np.swapaxes(covariances.reshape(count, t, count, t), 1, 2)
+    J = change(T_wc, convention, _SPLIT)
+    P = J[:, None] @ P @ np.swapaxes(J, 1, 2)
+    VP = np.einsum("kta,kjtu->jau", V, P)
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
-    lost = UW @ VP
-    result = P - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
+    result = _projected(P[range(count), range(count)], UW, VP, np.sum(VP @ V, axis=0))
     return converted(result, T_wc, _SPLIT, convention)
+
+
+def _projected_by_blocks(
+    T_wc: Float[np.ndarray, "k d d"],
+    covariances: Float[np.ndarray, "k t t"],
+    convention: Convention,
+    align: str,
+    line: Float[np.ndarray, " 3"] | None,
+) -> Float[np.ndarray, "k t t"]:
+    """The same of errors that are independent: its sums over all poses first, then every pose."""
+
+    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        U = gauge_directions(T_wc[part], align)
+        V = _fitted(U, line)
+        P = converted(covariances[part], T_wc[part], convention, _SPLIT)
+        return U, V, P, np.swapaxes(V, 1, 2) @ P
+
+    VU, VPV = np.zeros(()), np.zeros(())
+    for part in blocks(len(T_wc)):
+        U, V, _, VP = of(part)
+        VU, VPV = VU + np.einsum("kta,ktb->ab", V, U), VPV + np.sum(VP @ V, axis=0)
+    W, result = np.linalg.pinv(VU), np.empty_like(covariances)
+    for part in blocks(len(T_wc)):
+        U, _, P, VP = of(part)
+        result[part] = converted(_projected(P, U @ W, VP, VPV), T_wc[part], _SPLIT, convention)
+    return result
+
+
+def _projected(P: np.ndarray, UW: np.ndarray, VP: np.ndarray, VPV: np.ndarray) -> np.ndarray:
+    lost = UW @ VP
+    return P - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
 
 
 def _fitted(
@@ -202,22 +239,6 @@ def _fitted(
         V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
         V[:, 3:, 3:6] = about
     return V
-
-
-def _in_split(
-    T_wc: np.ndarray, covariances: np.ndarray, convention: Convention, V: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return P of every pose, (VᵀP) at every pose, and VᵀPV."""
-    count, t = V.shape[:2]
-    if covariances.ndim == 3:
-        P = converted(covariances, T_wc, convention, _SPLIT)
-        VP = np.swapaxes(V, 1, 2) @ P
-        return P, VP, np.sum(VP @ V, axis=0)
-    blocks = np.swapaxes(covariances.reshape(count, t, count, t), 1, 2)
-    J = change(T_wc, convention, _SPLIT)
-    blocks = J[:, None] @ blocks @ np.swapaxes(J, 1, 2)
-    VP = np.einsum("kta,kjtu->jau", V, blocks)
-    return blocks[range(count), range(count)], VP, np.sum(VP @ V, axis=0)
 
 
 def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.ndarray, "k t g"]:
@@ -291,6 +312,9 @@ def _runs(poses: Poses) -> Iterator[Poses]:
     """Yield every run by itself, of the poses that were logged."""
     for run, logged in enumerate(poses.logged):
         joint = None
+        if poses.joint is None and logged.all():
+            yield Poses(*(x[run] for x in poses[:4]))
+            continue
         if poses.joint is not None:
             rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
             joint = poses.joint[run][np.ix_(rows, rows)]
@@ -300,6 +324,10 @@ def _runs(poses: Poses) -> Iterator[Poses]:
 def _each_run(
     poses: Poses, convention: Convention, lay: Callable[[Poses, Convention], Poses]
 ) -> Poses:
+    if len(poses.logged) == 1 and poses.logged.all():
+        moved = lay(next(_runs(poses)), convention)
+        joint = None if moved.joint is None else moved.joint[None]
+        return Poses(*(x[None] for x in moved[:3]), poses.logged, joint)
     result = [x.copy() for x in poses[:3]]
     joint = None if poses.joint is None else poses.joint.copy()
     for number, run in enumerate(_runs(poses)):
@@ -314,6 +342,7 @@ def _each_run(
 
 def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
     """Whether σ at the first pose of every run is small, along the gauge's directions."""
+    poses = poses.some()
     n, there = poses.estimates.shape[-1] - 1, poses.logged
     split = converted(poses.covariances, poses.estimates, convention, _SPLIT)
     sigma = np.sqrt(np.maximum(np.diagonal(split, axis1=2, axis2=3), 0.0))
@@ -349,18 +378,22 @@ def _to_all(run: Poses, convention: Convention, *, align: str) -> Poses:
 
 def _line(run: Poses, convention: Convention) -> Float[np.ndarray, " n"] | None:
     """The direction of an estimate on a straight line, by the largest σ of every position."""
-    n = run.estimates.shape[-1] - 1
-    split = converted(run.covariances, run.estimates, convention, _SPLIT)
+    n, every = run.estimates.shape[-1] - 1, -(-len(run.estimates) // MOST)
+    T = run.estimates[::every]
+    split = converted(run.covariances[::every], T, convention, _SPLIT)
     variance = np.linalg.eigvalsh(split[:, :n, :n])[:, -1]
-    return straight_line(run.estimates[:, :n, n], np.sqrt(np.maximum(variance, 0.0)))
+    return straight_line(T[:, :n, n], np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
     """Return estimates and covariances in another world."""
-    J = motion.derivative(run.estimates, convention)
-    P, joint = J @ run.covariances @ np.swapaxes(J, 1, 2), run.joint
+    P, joint = np.empty_like(run.covariances), run.joint
+    for part in blocks(len(P)):
+        J = motion.derivative(run.estimates[part], convention)
+        P[part] = J @ run.covariances[part] @ np.swapaxes(J, 1, 2)
     if joint is not None:
+        J = motion.derivative(run.estimates, convention)
         count, t = J.shape[:2]
-        blocks = np.einsum("kab,kblc->kalc", J, joint.reshape(count, t, count, t), optimize=True)
-        joint = np.einsum("kalc,ldc->kald", blocks, J, optimize=True).reshape(joint.shape)
+        half = np.einsum("kab,kblc->kalc", J, joint.reshape(count, t, count, t), optimize=True)
+        joint = np.einsum("kalc,ldc->kald", half, J, optimize=True).reshape(joint.shape)
     return run._replace(estimates=motion.moved(run.estimates), covariances=P, joint=joint)

@@ -41,6 +41,9 @@ def causes(
     yield from _repeated(poses)
     if found.verdict["word"] not in WORSE or convention.scale == "given":
         return
+    few = poses.some()
+    if few is not poses:
+        poses, found = few, compared(few, align, ())
     spatial = poses.estimates.shape[-1] == 4
     turns = spatial and any(name.startswith("r") for name in found.names)
     for look in ((_w_first,) if turns else ()) + (_worlds, _tilt, _mounting):
@@ -80,6 +83,8 @@ def _rms(values: np.ndarray) -> float:
 
 def _repeated(poses: Poses) -> Iterator[Mistake]:
     """Runs, said to be independent, with the same rows: their poses are equal to the last digit."""
+    if len(poses.logged) < 2:
+        return
     rows = [
         {pose.tobytes() for pose in run[logged]}
         for run, logged in zip(poses.estimates, poses.logged, strict=True)

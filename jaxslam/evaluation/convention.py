@@ -20,7 +20,7 @@ All matrices that change one into another have determinant one: a wrong conventi
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -59,6 +59,8 @@ Axes = Int[np.ndarray, " m"]
 
 
 Result = TypeVar("Result")
+BLOCK = 8192
+"""The poses whose matrices are computed at once."""
 CHOICES = {
     "error": ("right", "left", "split"),
     "axes": ("body", "world", "mixed", "rpy"),
@@ -127,14 +129,23 @@ def geometry_of(poses: Matrices) -> Geometry:
     return SPATIAL if poses.shape[-1] == 4 else PLANAR
 
 
+def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
+    """Slices of at most that size, one after another: matrices of so many stay in the cache."""
+    yield from (slice(i, min(i + size, count)) for i in range(0, count, size))
+
+
 def pose_errors(
     convention: Convention,
     estimates: Float[np.ndarray, "*batch d d"],
     truths: Float[np.ndarray, "*batch d d"],
 ) -> Float[np.ndarray, "*batch t"]:
     """The error of every pose in the convention."""
-    error = _in_float64(_errors, convention.error, estimates, truths)
-    return np.einsum("...ij,...j->...i", turning(convention, estimates), error)
+    T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
+    result = np.empty((len(T), geometry_of(T).tangent_dim))
+    for part in blocks(len(T)):
+        error = _in_float64(_errors, convention.error, T[part], true[part])
+        result[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), error)
+    return result.reshape(*estimates.shape[:-2], -1)
 
 
 def truth_derivatives(
@@ -175,7 +186,10 @@ def converted(
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Return J of `ξ_new = J ξ_old`, to first order."""
-    return from_right(new, poses) @ np.linalg.inv(from_right(old, poses))
+    M = from_right(old, poses)
+    # Blocks of rotations, but for the adjoint of left errors and the rates of angles.
+    orthogonal = old.error != "left" and old.axes != "rpy"
+    return from_right(new, poses) @ (np.swapaxes(M, -1, -2) if orthogonal else np.linalg.inv(M))
 
 
 def turning(convention: Convention, estimates: Matrices) -> Squares:

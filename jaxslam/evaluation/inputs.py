@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, one_line, read_arrays
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.evaluation.convention import CHOICES, Joints, Values, geometry_of
+from jaxslam.evaluation.convention import BLOCK, CHOICES, Joints, Values, blocks, geometry_of
 from jaxslam.io.logs.log import check_seconds
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
@@ -65,7 +65,9 @@ def all_nan(array: Values) -> Mask:
 
 
 def filled(array: Values, logged: Mask, value: ArrayLike) -> Values:
-    """Return the array with a value at every step that was not logged."""
+    """Return the array with a value at every step that was not logged; itself, if all were."""
+    if logged.all():
+        return array
     return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
 
 
@@ -256,6 +258,20 @@ def whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) 
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
     """
+    steps = max(BLOCK // len(errors), 1) if errors.ndim == 3 else BLOCK
+    if errors.shape[-2] <= steps:
+        return _whitened(errors, covariances)
+    result = np.empty_like(errors)
+    try:
+        for part in blocks(errors.shape[-2], steps):
+            of = (..., part, slice(None))
+            result[of] = _whitened(errors[of], covariances[(*of, slice(None))])
+    except ValueError:  # which names run and step of a part
+        return _whitened(errors, covariances)
+    return result
+
+
+def _whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerAxis:
     variance = np.diagonal(covariances, axis1=-2, axis2=-1)
     if (variance <= 0).any():
         run, step, axis = np.argwhere(variance <= 0)[0]
@@ -290,6 +306,10 @@ def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoRet
     )
 
 
+MOST = 20_000
+"""The most poses by which what needs no more of them is decided."""
+
+
 class Poses(NamedTuple):
     """Runs of estimated poses T_wc, their covariances, and the truth."""
 
@@ -300,6 +320,16 @@ class Poses(NamedTuple):
     """A mask of the steps that are there; the others are identities, of unit covariance."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
+
+    def some(self) -> Poses:
+        """Steps of equal distances, with the first one of every run: `MOST` poses, or all."""
+        every = -(-self.logged.size // MOST)
+        if every < 2 or self.joint is not None:
+            return self
+        first = np.argmax(self.logged, axis=1)
+        steps = np.union1d(np.arange(0, self.logged.shape[1], every), first)
+        few = (x[:, steps] for x in (self.estimates, self.covariances, self.truths, self.logged))
+        return Poses(*few)
 
 
 def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
@@ -342,7 +372,8 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
         joints = _joint(joints, np.repeat(logged, t, axis=1))
     for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
         check_finite(what, x, logged)
-        if (largest := np.abs(x[logged]).max()) > LARGEST:
+        known = filled(x, logged, 0.0)
+        if (largest := max(known.max(), -known.min())) > LARGEST:
             raise ValueError(f"{what} contain {largest:.2g}; the limit is {LARGEST:.0e}")
     T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
     _check_rigid("estimates", T)

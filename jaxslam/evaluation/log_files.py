@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypedDict
 
@@ -16,7 +15,7 @@ from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
 from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
+from jaxslam.evaluation.result import Evaluation, advice, described, evaluate, evaluate_nees
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.tracked_frames import left_out
 from jaxslam.io import ros
@@ -77,7 +76,7 @@ def evaluate_log(
             align=align, axes_used=axes_used, truth_sigma=truth_sigma, time_offset=time_offset,
         )  # fmt: skip
         told = f"{beside.headline.partition(':')[0]} (of innovations); {advice(beside, own)}"
-        return replace(own, notes=(*own.notes, told))
+        return described(own, notes=(*own.notes, told))
     (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
     estimate = estimate or topic or None
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
@@ -92,7 +91,7 @@ def evaluate_log(
         arrays, runs, steps = (read_arrays_of(source), (), ()) if binary else read_csv(source)
         found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
         told = (advice(found),) if found.quantity == "NIS" and found.names else ()
-        return replace(found, run_names=runs, notes=(*found.notes, *told))
+        return described(found, run_names=runs, notes=(*found.notes, *told))
     if nis:
         raise ValueError(
             f"{source}: innovations must be in an npz or CSV file, not in a trajectory"
@@ -287,13 +286,13 @@ def evaluate_runs(
                 f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
                 f"instead of {before:.4g}",
             )
-            found = replace(found, causes=(clock,))
+            found = described(found, causes=(clock,))
     told += (
         *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
     if not read[0].said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
-    return replace(found, notes=(*found.notes, *told), run_names=names)
+    return described(found, notes=(*found.notes, *told), run_names=names)
 
 
 def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> Evaluation:
@@ -378,7 +377,9 @@ def named(
 
     try:
         found = evaluation()
-        return replace(found, causes=tuple(x._replace(told=renamed(x.told)) for x in found.causes))
+        return described(
+            found, causes=tuple(x._replace(told=renamed(x.told)) for x in found.causes)
+        )
     except ValueError as error:
         raise ValueError(f"{source}: {renamed(str(error))}") from None
 

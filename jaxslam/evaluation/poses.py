@@ -18,6 +18,7 @@ from jaxslam.evaluation.causes import causes
 from jaxslam.evaluation.convention import (
     Axes,
     Convention,
+    Values,
     alternatives,
     geometry_of,
     pose_errors,
@@ -37,7 +38,7 @@ from jaxslam.evaluation.inputs import (
     whitened,
     without_known,
 )
-from jaxslam.evaluation.result import Evaluation
+from jaxslam.evaluation.result import Evaluation, described
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
@@ -118,7 +119,7 @@ def evaluate_poses(
     if not told and identified.doubtful and not identified.stands:
         told = (Mistake("the convention of the covariances is another", identified.sentence),)
     how = {"times": at, "timed": times is not None, "identified": identified}
-    return replace(found, causes=told, **how)
+    return described(found, causes=told, **how)
 
 
 def as_stated(
@@ -160,16 +161,16 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     axes = np.array([i for i, name in enumerate(names) if name in used])
     world = aligned(poses, convention, align, axes)
     errors = pose_errors(convention, world.poses.estimates, world.poses.truths)[..., axes]
-    P = world.poses.covariances[..., axes[:, None], axes]
+    P = _along(world.poses.covariances, axes)
     start, logged, known = without_known(errors, P, world.poses.logged)
     later = _later(world.poses, start, logged)
-    errors, P = errors[:, start:], later.covariances[..., axes[:, None], axes]
+    errors, P = errors[:, start:], _along(later.covariances, axes)
     fitted, axis_fitted, scale, notes = 0.0, np.zeros(len(axes)), None, (*known, *world.notes)
     if world.given or align == "sim3":
         whitened(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
-        P, (metres, degrees) = later.covariances[..., axes[:, None], axes], truth_sigma
+        P, (metres, degrees) = _along(later.covariances, axes), truth_sigma
         notes += (f"every stated σ includes that of the truth, {metres:g} m and {degrees:g}°",)
     if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
@@ -179,6 +180,10 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     return _PoseErrors(
         errors, P, whitened(errors, P), start, later.logged, fitted, axis_fitted, scale, notes
     )
+
+
+def _along(P: Values, axes: Axes) -> Values:
+    return P if len(axes) == P.shape[-1] else P[..., axes[:, None], axes]
 
 
 def _later(poses: Poses, start: int, logged: Mask) -> Poses:
@@ -217,7 +222,7 @@ def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
 
 def _identified(poses: Poses, stated: Convention, options: _Options) -> Identification:
     """Identify the convention among those of the same scale; else among those given the scale."""
-    geometry, used = geometry_of(poses.estimates), options.used
+    geometry, used, poses = geometry_of(poses.estimates), options.used, poses.some()
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
         result = {}
@@ -288,6 +293,9 @@ def estimated(
     than a thousandth of σ, and have no correlation with those of other axes.
     """
     names = convention.names(geometry_of(poses.estimates))
+    few = poses.some()
+    if few is not poses and not estimated(few, convention, align)[1]:
+        return names, ()
     world = aligned(poses, convention, align, ~_constant(poses)).poses
     e = pose_errors(convention, world.estimates, world.truths)[poses.logged]
     P = world.covariances[poses.logged]

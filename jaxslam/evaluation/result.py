@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -263,6 +263,13 @@ class Evaluation:
 
     def axis_verdict(self, axis: int) -> Verdict:
         """The verdict on one axis alone, of one degree of freedom."""
+        return self._axis_verdicts[axis]
+
+    @cached_property
+    def _axis_verdicts(self) -> tuple[Verdict, ...]:
+        return tuple(self._of_axis(axis) for axis in range(len(self.names)))
+
+    def _of_axis(self, axis: int) -> Verdict:
         with np.errstate(over="ignore"):
             normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
             nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
@@ -382,6 +389,15 @@ class Evaluation:
     def expected(self) -> str:
         """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
+
+
+def described(found: Evaluation, **words: Any) -> Evaluation:
+    """The same errors with other words about them, times, or causes."""
+    result = replace(found, **words)
+    for name in ("_of_nees", "_axis_verdicts"):  # which take long, and are of errors alone
+        if name in found.__dict__:
+            result.__dict__[name] = found.__dict__[name]
+    return result
 
 
 def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
