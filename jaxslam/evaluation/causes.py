@@ -303,7 +303,9 @@ def _in_all_runs(X: Float[np.ndarray, "d d"], moved: Poses) -> bool:
         return np.column_stack([T[:, :n, n], S[:, *np.triu_indices(n, 1)]])
 
     runs = zip(moved.estimates, moved.truths, moved.logged, strict=True)
-    each = np.array([parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs])
+    each = np.array(
+        [parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs]
+    )
     if len(each) < FEWEST:
         return False
     t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
