@@ -34,7 +34,7 @@ MAX_TIME_DIFFERENCE = 0.01
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
 SMALL = 0.5
-"""The largest σ of a first pose, of the median of all, at which runs are aligned."""
+"""The largest σ by the error of a first pose, of the median of all, at which runs are aligned."""
 
 
 class Similarity(NamedTuple):
@@ -341,15 +341,26 @@ def _each_run(
 
 
 def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
-    """Whether σ at the first pose of every run is small, along the gauge's directions."""
+    """Whether what the error of a run's first pose moves the others by is small beside their σ.
+
+    The farther a pose is, the more it is moved by the rotation of the first.
+    """
     poses = poses.some()
-    n, there = poses.estimates.shape[-1] - 1, poses.logged
-    split = converted(poses.covariances, poses.estimates, convention, _SPLIT)
-    sigma = np.sqrt(np.maximum(np.diagonal(split, axis1=2, axis2=3), 0.0))
-    first = sigma[range(len(there)), np.argmax(there, axis=1)].max(axis=0)
-    parts = [slice(0, n), slice(n, None) if align != "yaw" or n == 2 else slice(5, 6)]
-    median = [np.median(sigma[there][:, part].max(axis=1)) for part in parts]
-    return all(first[part].max() <= SMALL * x for part, x in zip(parts, median, strict=True))
+    n = poses.estimates.shape[-1] - 1
+    upright = align == "yaw" and n == 3
+    fixed = np.array([0, 1, 2, 5]) if upright else np.arange(poses.covariances.shape[-1])
+    for run in _runs(poses):
+        P = converted(run.covariances, run.estimates, convention, _SPLIT)
+        U = gauge_directions(run.estimates, align)
+        J = U @ np.linalg.inv(U[0, fixed])
+        moved = J @ P[0][np.ix_(fixed, fixed)] @ np.swapaxes(J, 1, 2)
+        for part in (slice(0, n), slice(5, 6) if upright else slice(n, None)):
+            variance, own = (
+                np.diagonal(x, axis1=1, axis2=2)[:, part].max(axis=1) for x in (moved, P)
+            )
+            if np.median(variance) > SMALL**2 * np.median(own):
+                return False
+    return True
 
 
 def _by_first(run: Poses, convention: Convention, *, yaw: bool) -> Poses:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import stdtr
 
 from jaxslam.evaluation.alignment import aligned, gauge_directions, similarity
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
@@ -32,6 +33,8 @@ LESS = 3.0
 MANY = 10
 """Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
+FEWEST, ALPHA = 4, 1e-3
+"""The fewest runs that a constant can be common to, and the chance that one is found of none."""
 
 
 def causes(
@@ -39,7 +42,7 @@ def causes(
 ) -> Iterator[Mistake]:
     """The causes of an evaluation that found a filter over-confident; none of others."""
     yield from _repeated(poses)
-    if found.verdict["word"] not in WORSE or convention.scale == "given":
+    if not suspect(found) or convention.scale == "given":
         return
     few = poses.some()
     if few is not poses:
@@ -53,6 +56,11 @@ def causes(
             return
     if turns and (mistake := _half_angles(poses, convention, align, found, compared)):
         yield mistake
+
+
+def suspect(found: Evaluation) -> bool:
+    """Whether errors are larger than σ says, or are taken for ones in degrees for that."""
+    return bool(found.mistakes) or found.verdict["word"] in WORSE
 
 
 def _nees(found: Evaluation) -> float:
@@ -120,7 +128,7 @@ def _w_first(
         return None
     for name, which in (("estimate", "estimates"), ("truth", "truths")):
         changed = poses._replace(**{which: _reread(getattr(poses, which), there)})
-        if off(changed.estimates, changed.truths) < before / 10:
+        if off(changed.estimates, changed.truths) < before / 4:
             fixed = compared(changed, align, ())
             return Mistake(
                 f"quaternions of the {name} have w first",
@@ -206,11 +214,16 @@ def _mounting(
             best, X = fixed, other
     n = len(X) - 1
     angle, metres = float(_angles(X[:n, :n])), float(np.linalg.norm(X[:n, n]))
-    if best is found or not _of_body(poses, found, best, angle):
+    moved = _unmounted(poses, X)
+    if best is found:
+        return None
+    if not _of_body(poses, found, best, angle) and not (
+        not_disproved(best.verdict)
+        and _in_all_runs(X, aligned(moved, convention, align, np.arange(len(found.names))).poses)
+    ):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
     parts += [f"a lever arm of {metres:.3g} m"] if metres > 0 else []
-    moved = _unmounted(poses, X)
     return Mistake(
         "estimate and truth are of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
@@ -305,6 +318,24 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
     in_world = turns.any() and _rms(constant) < 0.5 * angle
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
     return bool((ratio > LESS).any() and (ratio > LESS * left).any() and not (in_world and few))
+
+
+def _in_all_runs(X: Float[np.ndarray, "d d"], moved: Poses) -> bool:
+    """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
+    n = len(X) - 1
+
+    def parts(T: Matrices) -> np.ndarray:
+        S = T[:, :n, :n] - np.swapaxes(T[:, :n, :n], 1, 2)
+        return np.column_stack([T[:, :n, n], S[:, *np.triu_indices(n, 1)]])
+
+    runs = zip(moved.estimates, moved.truths, moved.logged, strict=True)
+    each = np.array(
+        [parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs]
+    )
+    if len(each) < FEWEST:
+        return False
+    t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
+    return bool(2 * stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
 def _unmounted(poses: Poses, X: Float[np.ndarray, "d d"]) -> Poses:

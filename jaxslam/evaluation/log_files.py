@@ -10,6 +10,7 @@ from typing import TypedDict
 import numpy as np
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
+from jaxslam.evaluation.causes import suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
@@ -286,7 +287,7 @@ def evaluate_runs(
                 f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
                 f"instead of {before:.4g}",
             )
-            found = described(found, causes=(clock,))
+            found = described(found, causes=(clock, *fixed.causes))
     told += (
         *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
@@ -309,8 +310,8 @@ def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> E
 
 def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None:
     """By how much the estimates are late and its σ, by the rotations of all runs; None where that
-    is not beyond doubt, or the filter is not over-confident, or another cause is named."""
-    if found.causes or found.verdict["word"] not in ("over-confident", "lost"):
+    is not beyond doubt, or the filter is not over-confident."""
+    if not suspect(found):
         return None
     offsets = [one.offset for one in read[:LOOKED_AT]]
     late, sigma = (
