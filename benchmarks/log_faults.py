@@ -196,8 +196,8 @@ def judged(name: str, factor: float, number: int) -> tuple[str, Evaluation]:
             written(Path(folder), log, name)
             found = evaluate_log(folder, align=fault.align)
     else:
-        how = {"align": fault.align}
-        found = evaluate_poses(log.estimates, log.covariances, log.truths, log.convention, **how)
+        poses = log.estimates, log.covariances, log.truths, log.convention
+        found = evaluate_poses(*poses, align=fault.align)
     if fault.word in " ".join([*(x.what for x in found.mistakes), *found.notes]) and fault.word:
         return "named", found
     if found.mistakes:

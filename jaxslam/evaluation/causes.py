@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
-from scipy.special import stdtr
 
 from jaxslam.evaluation.alignment import aligned, gauge_directions, similarity
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
@@ -335,7 +335,7 @@ def _in_all_runs(X: Float[np.ndarray, "d d"], moved: Poses) -> bool:
     if len(each) < FEWEST:
         return False
     t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
-    return bool(2 * stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
+    return bool(2 * scipy.special.stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
 def _unmounted(poses: Poses, X: Float[np.ndarray, "d d"]) -> Poses:
