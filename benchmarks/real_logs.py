@@ -214,7 +214,7 @@ def as_smfeval(folder: Path, *, between: bool = False) -> dict[str, float]:
     they are in the alignment.
     """
     _, _, e, P = right_errors(folder, between=between)
-    nees = normalised(e[:, :3], P[:, :3, :3])
+    nees = normalised(e[None, :, :3], P[None, :, :3, :3])[0]
     return {
         "n": len(nees),
         "anees": float(np.mean(nees)),
@@ -245,7 +245,7 @@ def fitted_by_weight(folder: Path, *, arm: bool) -> list[float]:
     )
     e = errors(best.x)
     parts = slice(0, 3), slice(3, 6)
-    return [float(np.mean(normalised(e[:, part], P[:, part, part]))) for part in parts]
+    return [float(np.mean(normalised(e[None, :, x], P[None, :, x, x]))) for x in parts]
 
 
 def report_of_smfeval(folder: Path) -> dict[str, float]:
