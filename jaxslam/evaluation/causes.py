@@ -30,6 +30,8 @@ UNDETERMINED = 0.05
 """The share of the largest singular value below which motion does not determine a direction."""
 LESS = 3.0
 """The factor by which a constant that is fitted lessens the errors that it explains."""
+TURNED = np.radians(60)
+"""A rotation between worlds that is no error of a filter's first heading."""
 MANY = 10
 """Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
@@ -61,6 +63,10 @@ def causes(
 def suspect(found: Evaluation) -> bool:
     """Whether errors are larger than σ says, or are taken for ones in degrees for that."""
     return bool(found.mistakes) or found.verdict["word"] in WORSE
+
+
+def _right(found: Evaluation) -> bool:
+    return not found.mistakes and not_disproved(found.verdict)
 
 
 def _nees(found: Evaluation) -> float:
@@ -150,7 +156,7 @@ def _reread(T: Matrices, there: np.ndarray) -> Matrices:
 def _worlds(
     poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
 ) -> Mistake | None:
-    """Positions that agree after an alignment, and not at the first pose without."""
+    """Positions that agree after an alignment, by a large rotation or of first poses apart."""
     if align != "none":
         return None
     n = poses.estimates.shape[-1] - 1
@@ -169,7 +175,8 @@ def _worlds(
         tilts.append(float(np.arccos(np.clip(fit.rotation[-1, -1], -1, 1))) if n == 3 else 0.0)
     rms, left = float(np.median(before)), float(np.median(after))
     sigma = float(np.nanmedian(np.where(np.isfinite(found.sigmas), found.sigmas, np.nan)))
-    if not (rms > 5 * max(left, 1e-12) and np.median(first) > max(0.2 * rms, 5 * sigma)):
+    apart = np.median(first) > max(0.2 * rms, 5 * sigma) or np.median(angles) > TURNED
+    if not (rms > 5 * max(left, 1e-12) and apart):
         return None
     by = "yaw" if n == 3 and np.median(tilts) < np.radians(2) else "se3"
     if np.median(scaled) < left / LESS:
@@ -190,7 +197,7 @@ def _tilt(
         return None
     other = "yaw" if align == "se3" else "se3"
     fixed = compared(poses, other, ())
-    if not not_disproved(fixed.verdict) or _nees(fixed) > _nees(found) / 1.2:
+    if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
         return None
     why = (
         "the filter knows roll and pitch, which se3 aligns too"
@@ -218,7 +225,7 @@ def _mounting(
     if best is found:
         return None
     if not _of_body(poses, found, best, angle) and not (
-        not_disproved(best.verdict)
+        _right(best)
         and _in_all_runs(X, aligned(moved, convention, align, np.arange(len(found.names))).poses)
     ):
         return None
@@ -361,7 +368,7 @@ def _half_angles(
     fixed = compared(
         poses._replace(covariances=scale[:, None] * poses.covariances * scale), align, ()
     )
-    if not not_disproved(fixed.verdict):
+    if not _right(fixed):
         return None
     return Mistake(
         "half angles",

@@ -19,6 +19,8 @@ FURTHEST = 0.5
 """The largest offset that is looked for, s."""
 BEYOND = 3.0
 """An offset of so many σ is one."""
+LEAST_VARIANCE = 0.25
+"""The least variance of an offset, of what it were without correlations."""
 _LEAST = 20
 """The fewest rotations that determine one."""
 
@@ -43,8 +45,7 @@ def clock_offset(
 ) -> Offset | None:
     """The offset by least squares; None where rotations do not determine it.
 
-    Of a grid as fine as the truth the best one, refined by a parabola through its neighbours; σ is
-    that of least squares, of residuals that are independent.
+    Of a grid as fine as the truth the best one, refined by a parabola through its neighbours.
     """
     known = ~np.isnan(truths[:, 0, 0])
     true_times, truths = true_times[known], truths[known]
@@ -53,38 +54,47 @@ def clock_offset(
     step = float(np.median(np.diff(true_times)))
     own = _increments(estimates)
 
-    def cost(late: float) -> tuple[float, int]:
+    def residuals(late: float) -> Float[np.ndarray, "k r"]:
         theirs = _increments(interpolated(true_times, truths, times - late))
         there = ~np.isnan(theirs).any(axis=1)
         if there.sum() < _LEAST:
-            return np.inf, 0
-        a, b = own[there], theirs[there]
-        if a.shape[1] == 3:
-            left, _, right = np.linalg.svd(a.T @ b)
+            return np.full_like(own, np.nan)
+        if own.shape[1] == 3:
+            left, _, right = np.linalg.svd(own[there].T @ theirs[there])
             left[:, -1] *= np.sign(np.linalg.det(left @ right))
-            b = b @ (left @ right).T
-        return float(np.mean(np.sum((a - b) ** 2, axis=1))), a.size
+            theirs = theirs @ (left @ right).T
+        return own - theirs
 
-    grid = np.arange(-FURTHEST, FURTHEST + step / 2, max(step, 2e-3))
-    costs = np.array([cost(late)[0] for late in grid])
-    if not np.isfinite(costs).any():
-        return None
-    best = float(grid[int(np.argmin(costs))])
-    if abs(best) >= FURTHEST - 2 * step:
-        return None
+    def cost(late: float) -> float:
+        found = np.sum(residuals(late) ** 2, axis=1)
+        return float(np.nanmean(found)) if np.isfinite(found).any() else np.inf
+
     width = max(step, 2e-3)
+    grid = np.arange(-FURTHEST, FURTHEST + step / 2, width)
+    costs = np.array([cost(late) for late in grid])
+    best = float(grid[int(np.argmin(costs))])
+    if not np.isfinite(costs).any() or abs(best) >= FURTHEST - 2 * step:
+        return None
     for _ in range(6):
-        (low, _), (middle, count), (high, _) = (cost(best + x) for x in (-width, 0.0, width))
+        low, middle, high = (cost(best + x) for x in (-width, 0.0, width))
         curvature = low - 2 * middle + high
-        if not np.isfinite(curvature) or curvature <= 0:
-            return None
+        if not np.isfinite(curvature) or curvature <= 0:  # flat, within what is rounded
+            break
         best += float(np.clip((low - high) / (2 * curvature), -1, 1)) * width
         width /= 2
-    # Sum of squares S(δ) = S₀ + ½ S'' δ², each residual of variance S₀/count.
-    dims = own.shape[1]
-    variance = middle / dims
-    second = curvature / (2 * width) ** 2 * count / dims
-    return Offset(best, float(np.sqrt(2 * variance / second)))
+    return Offset(best, _sigma(*(residuals(best + x) for x in (-step, 0.0, step)), 2 * step))
+
+
+def _sigma(before: np.ndarray, now: np.ndarray, after: np.ndarray, apart: float) -> float:
+    """σ of a least squares, of residuals of which neighbours correlate: the error of an orientation
+    is in two increments, with either sign."""
+    slope = (after - before) / apart
+    score = np.nan_to_num(np.sum(slope * now, axis=1))
+    alone = float(score @ score)
+    # What few neighbours tell is uncertain itself.
+    variance = max(alone + 2 * float(score[1:] @ score[:-1]), LEAST_VARIANCE * alone)
+    information = float(np.nansum(slope**2))
+    return float(np.sqrt(variance)) / information if information > 0 else np.inf
 
 
 def _increments(T: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "k r"]:

@@ -22,7 +22,7 @@ _MEANINGS = {
     ),
     "position": re.compile(rf"{_BEFORE}(?:t|p|p_rs_r)?[._ ]?([xyz])(?:_m)?"),
     "turn": re.compile(rf"{_TURN}([xyzw])"),
-    "angle": re.compile(r"θ|theta|yaw|heading|th|psi"),
+    "angle": re.compile(r"(?:θ|theta|yaw|heading|th|psi)(?:_?deg(?:rees)?|_?rad)?"),
     "variance": re.compile(r"p([xyz]{2})|q([rpy]{2})"),
 }
 _POSITION, _TURNS = "xyz", "rpy"
