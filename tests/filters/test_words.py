@@ -173,6 +173,10 @@ def test_words_are_pieces():
         start=FromWindow(Schedule.of(PLANAR, 8)), gate=Gate(),
     )  # fmt: skip
     assert made_or_told("+".join(names), InverseScaling()) == slam
+    walks = replace(slam, depth=replace(slam.depth, walk=0.03))
+    assert made_or_told("+".join([*names, "walk"]), InverseScaling()) == walks
+    names.remove("scene50")
+    assert made_or_told("+".join([*names, "walk3"]), InverseScaling()) == walks
     assert slam != replace(slam, gate=None) != replace(slam, gate=None, mixture=Mixture(5))
 
 
@@ -183,8 +187,8 @@ def test_recommended_is_a_record(geometry, told):
     planar = geometry is PLANAR
     chosen = ("matched" if told else "standstill") + ("" if planar else "-6dof")
     spelt = {
-        (True, True): "scale_gauge+oc+scene50+mixture17",
-        (True, False): "scale_gauge+oc+scene50+mixture9",
+        (True, True): "scale_gauge+oc+scene50+walk3+mixture17",
+        (True, False): "scale_gauge+oc+scene50+walk3+mixture9",
         (False, True): "scale_gauge+oc+scene50+mixture5+rest",
         (False, False): "scale_gauge+oc+scene50+mixture3+rest8",
     }[told, planar]

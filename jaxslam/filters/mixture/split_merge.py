@@ -46,7 +46,7 @@ whose merger costs less than a quarter of it are one."""
 FEW = 7
 """Members up to which that is so. Of k members it is `(k/FEW)⁴` times as much, as every one costs
 the same time."""
-ACROSS, ENOUGH = 1e-2, 1e-3
+ACROSS, ENOUGH = 1e-2, 1e-4
 """Costs of a sum as one Gaussian, σ² of a pixel for all landmarks together. Below the first, splits
 are across the displacement alone; below the second the sum ends: pairs are merged whatever it
 costs, and no member is split."""
