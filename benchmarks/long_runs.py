@@ -97,11 +97,12 @@ def drawn_of(results: dict[str, Any]) -> Figure:
 
 
 def _draw(ax: Axes, filters: dict[str, Any]) -> None:
-    ax.axhline(IDEAL, color=GREY, linewidth=0.8)
+    ax.axhline(IDEAL, color=GREY, linewidth=0.8, label="consistent")
     for index, (name, row) in enumerate(filters.items()):
         nees = np.array(row["nees"], float)
         ax.plot(row["at"], nees, **line_style(index), label=name)
-    ax.set(xscale="log", yscale="log", xlabel="step", ylim=(1, CUT))
+    ends = FIRST, max(row["at"][-1] for row in filters.values())
+    ax.set(xscale="log", yscale="log", xlabel="step", xlim=ends, ylim=(1, CUT))
 
 
 if __name__ == "__main__":

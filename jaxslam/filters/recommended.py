@@ -29,11 +29,11 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
 
     For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
     since no pixel observes the metre, and an error that is common to all depths, σ half of one
-    landmark's, which walks by 0.03 of that in a frame, as scenes change. One linearisation is not
-    enough while the direction of travel is unknown: so it is a Gaussian sum over the velocity's
-    direction, of at most 17 members in a plane and 9 in space, which ends in one Gaussian. Its
-    covariance is carried along the gauge (`+oc`): without that, thousands of frames make the scale
-    seem known.
+    landmark's. As scenes change, that error walks by 0.03 of one landmark's in a frame. One
+    linearisation is not enough while the direction of travel is unknown: so it is a Gaussian sum
+    over the velocity's direction, of at most 17 members in a plane and 9 in space, which ends in
+    one Gaussian. Its covariance is carried along the gauge (`+oc`): without that, thousands of
+    frames make the scale seem known.
 
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
     motion in a window of frames, of at most 5 and 3 members, and a common error that stays.

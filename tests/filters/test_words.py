@@ -153,6 +153,8 @@ def test_words_in_any_order_are_the_same_filter(base):
             told = [why for which, why in IN_WORLD if which <= {*words}]
             if "rest" in words and "mixture" not in words:
                 told.append("a start from a window is of a mixture that is split")
+            if "walk" in words and "scene" not in words:
+                told.append("walk is that of a common error of depths: give its σ, common, too")
             assert isinstance(one, str) == bool(told), (words, one)
             assert not told or re.search("|".join(told), one), (words, one)
 
@@ -175,8 +177,6 @@ def test_words_are_pieces():
     assert made_or_told("+".join(names), InverseScaling()) == slam
     walks = replace(slam, depth=replace(slam.depth, walk=0.03))
     assert made_or_told("+".join([*names, "walk"]), InverseScaling()) == walks
-    names.remove("scene50")
-    assert made_or_told("+".join([*names, "walk3"]), InverseScaling()) == walks
     assert slam != replace(slam, gate=None) != replace(slam, gate=None, mixture=Mixture(5))
 
 
