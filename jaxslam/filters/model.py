@@ -275,7 +275,7 @@ class SlamModel(eqx.Module):
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
         sensor = self.sensor_at(view.calibration)
         if view.depth_error is not None:
-            hidden = hidden + self.depth.sigma * view.depth_error
+            hidden = self.depth.with_common(hidden, view.depth_error)
         point, omega = sensor.locate(measured, hidden)
         if view.log_scale is not None:
             omega = omega * jnp.exp(view.log_scale[0])

@@ -29,13 +29,14 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
 
     For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
     since no pixel observes the metre, and an error that is common to all depths, σ half of one
-    landmark's. One linearisation is not enough while the direction of travel is unknown: so it is a
-    Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space,
-    which ends in one Gaussian. Its covariance is carried along the gauge (`+oc`): without that,
-    thousands of frames make the scale seem known.
+    landmark's. As scenes change, that error walks by 0.03 of one landmark's in a frame. One
+    linearisation is not enough while the direction of travel is unknown: so it is a Gaussian sum
+    over the velocity's direction, of at most 17 members in a plane and 9 in space, which ends in
+    one Gaussian. Its covariance is carried along the gauge (`+oc`): without that, thousands of
+    frames make the scale seem known.
 
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
-    motion in a window of frames, of at most 5 and 3 members.
+    motion in a window of frames, of at most 5 and 3 members, and a common error that stays.
 
     For odometry, and for a sensor that measures metres (then of Cartesian points): the paper's
     filter. What nothing observes
@@ -48,10 +49,12 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
     chosen: dict[str, Piece] = {} if sensor.hidden else {"landmark": Cartesian()}
     if motion.has_velocity and sensor.hidden:
-        depth = replace(depth, common=0.5) if depth.common is None else depth
+        told = _velocity_is_known(motion)
+        if depth.common is None:
+            depth = replace(depth, common=0.5, walk=0.03 if told else None)
         chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}
         chosen["correction"] = ObservabilityConstrained()
-        if not _velocity_is_known(motion):
+        if not told:
             chosen["mixture"] = Mixture(5 if planar else 3)
             chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})

@@ -73,6 +73,7 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
 
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
+    "walk": lambda slam, percent=3: replace(slam, depth=replace(slam.depth, walk=percent / 100)),
     "fej": lambda slam: replace(slam, correction=FirstEstimates()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
@@ -92,6 +93,8 @@ of the name. Its piece takes the place of the filter's own: in `recommended+dire
 recommended mixture. The number that may follow the name is
 
 - `scene`: σ of an error that is common to all priors on depth, in percent of one landmark's;
+- `walk`: σ by which that error, which it needs, changes from frame to frame, in percent of the
+  same;
 - `fej`: none;
 - `oc`, `iterated`: the steps of Gauss–Newton in an update;
 - `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;

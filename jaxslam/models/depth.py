@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import equinox as eqx
-from jaxtyping import Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
 
@@ -15,6 +16,9 @@ class InverseDepth(eqx.Module):
 
     c is estimated with everything else: the first landmarks inform those that follow how far away
     the scene is. Raises ValueError for numbers that are none, and for a walk of nothing in common.
+
+    Where c walks, the scene may become another, whose depths scatter as its distance does:
+    `1/z = e^(κ common c) (mean + σ e_i)` with κ = σ/mean, the same to first order in c.
     """
 
     mean: Float[AnyArray, ""] = number_field()
@@ -29,13 +33,20 @@ class InverseDepth(eqx.Module):
     where it was the metre."""
     walk: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
     """σ by which `common c` changes from frame to frame, in σ of one landmark's own part: scenes
-    change. None where it stays."""
+    change; `mean` is then positive. None where it stays."""
 
     def __check_init__(self) -> None:
         if self.walk is not None and self.common is None:
             raise ValueError("walk is that of a common error of depths: give its σ, common, too")
         for name in ("mean", "sigma"):
             check_shape(f"the {name} of the prior on 1/z", getattr(self, name), ())
+
+    def with_common(self, own: Array, error: Array) -> Array:
+        """1/z of landmarks that is `own` = mean + σ e_i by themselves, with the `error` common c
+        of all."""
+        if self.walk is None:
+            return own + self.sigma * error
+        return own * jnp.exp(self.sigma / self.mean * error)
 
     @staticmethod
     def beyond(nearest: Number) -> InverseDepth:

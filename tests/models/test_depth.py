@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import Case, each_geometry, named, quick_jit
@@ -68,6 +69,21 @@ def test_a_common_error_that_walks_forgets_as_much_in_every_frame(name):
     start = variances(None)
     np.testing.assert_allclose(variances(0.3), start + 0.3**2 * np.arange(1, 4), rtol=1e-9)
     np.testing.assert_allclose(start, start[0], rtol=1e-9)
+
+
+def test_where_a_common_error_walks_depths_scatter_as_their_mean_does():
+    """And to first order it is the sum of both errors that it is where it stays."""
+    still = InverseDepth(0.2, 0.1, common=0.5)
+    walks = replace(still, walk=0.03)
+    own = jnp.array([0.1, 0.2, 0.5])  # −1, 0 and 3 σ
+    twice = walks.with_common(own, jnp.log(2.0) * 0.2 / 0.1)
+    np.testing.assert_allclose(twice, 2 * own, rtol=1e-12)
+    one, other = (
+        jax.jvp(lambda e, of=of: of.with_common(own[1], e), (own[0] * 0,), (own[0] / own[0],))
+        for of in (still, walks)
+    )
+    np.testing.assert_allclose(one, [0.2, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(other, one, rtol=1e-6)
 
 
 def test_a_walk_is_of_a_common_error():

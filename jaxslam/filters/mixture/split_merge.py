@@ -46,7 +46,7 @@ whose merger costs less than a quarter of it are one."""
 FEW = 7
 """Members up to which that is so. Of k members it is `(k/FEW)⁴` times as much, as every one costs
 the same time."""
-ACROSS, ENOUGH = 1e-2, 1e-3
+ACROSS, ENOUGH = 1e-2, 1e-4
 """Costs of a sum as one Gaussian, σ² of a pixel for all landmarks together. Below the first, splits
 are across the displacement alone; below the second the sum ends: pairs are merged whatever it
 costs, and no member is split."""
@@ -56,14 +56,12 @@ SPLIT = 0.8
 
 def divided(slam: AbstractSlam, state: SumState, control: Control, seen: Features) -> SumState:
     """A predicted sum after splits, and as many mergers of other members: each takes three."""
-    n = slam.motion.geometry.point_dim
-
     cost = _root_of_cost(slam, state.likeliest, seen)
 
     def pixels_at(at: Core) -> Pixels:
         context = slam.model.given(at, Context(control))
         # Of the logarithm: a turn is not to be split for what it does to the translation.
-        return lambda core: cost @ log(slam.model.displacement(core, context))[:n]
+        return lambda core: cost @ log(slam.model.displacement(core, context))[: len(cost)]
 
     parts = _parts(pixels_at, state)
     return _split_and_merged(parts, max(1, state.log_weights.size // 3))
@@ -94,8 +92,7 @@ def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float
     M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
     # Nearly singular where one landmark is seen, and zero where none is.
     total = jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
-    eye = jnp.eye(slam.motion.geometry.point_dim, dtype=M.dtype)
-    return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
+    return jnp.sqrt(total) * cholesky(M / total + 1e-6 * jnp.eye(len(M), dtype=M.dtype)).root.T
 
 
 def _whitening(
@@ -186,8 +183,7 @@ def _planned(
         gain, one = gains[split], index == split
         others, cost = _cheapest(jnp.where(one[:, None] | one, jnp.inf, left))
         alike, least = _cheapest(jnp.where(both, left, jnp.inf))
-        worth = WORTH * jnp.maximum(1.0, count / FEW) ** 4
-        worth = jnp.where(one_serves, jnp.inf, worth)
+        worth = jnp.where(one_serves, jnp.inf, WORTH * jnp.maximum(1.0, count / FEW) ** 4)
         divided = (gain > cost) & (gain > worth)
         due = divided | (least < worth / 4)
         pair = jnp.where(divided, others, alike)
@@ -237,8 +233,7 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> State:
     c = by_core.shape[-1]
     slopes = parent.covariance[:, :c] @ by_core.T
     values, vectors = eigh(by_core @ slopes[:c])
-    variance = jnp.maximum(values[-1], 0.0)
-    sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
+    sigma = jnp.sqrt(jnp.maximum(values[-1], jnp.finfo(values.dtype).tiny))
     away = SPLIT * slopes @ vectors[:, -1] / sigma
     parent = replace(parent, covariance=parent.covariance - jnp.outer(away, away))
     return jax.vmap(lambda sign: plus(parent, sign * away))(jnp.array([-1.0, 1.0], away.dtype))

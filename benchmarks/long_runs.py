@@ -1,0 +1,109 @@
+"""Long runs among landmarks that come as others go: does a filter stay consistent to the end?
+
+    python benchmarks/long_runs.py
+
+What a filter takes for the depth of new landmarks is right in `laps-prior`, wrong in `laps-thrown`,
+and becomes wrong half way in `laps-change`. Results are added to `long_runs.json` one filter at a
+time; what it has, of as many runs, is not run again. `docs/long-runs.png` is drawn from it, by
+`--page` alone from what is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmark import RESULTS, Benchmark
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import jaxslam
+from jaxslam.plots.style import GREY, line_style, new_figure, save
+
+WORLDS = {
+    "laps-prior": "depths are as expected",
+    "laps-thrown": "depths are not as expected",
+    "laps-change": "depths change half way",
+}
+"""Scenarios, and what is drawn above them."""
+FIRST, MOST = 10, 60
+"""The first step of which numbers are kept, and how many steps, at even ratios."""
+CUT = 1e5
+"""NEES above which nothing is drawn."""
+IDEAL = 3
+"""NEES of a consistent filter in a plane."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LongRuns(Benchmark):
+    """Filters in long runs."""
+
+    scenarios: tuple[str, ...] = tuple(WORLDS)
+    """Scenarios."""
+    filters: tuple[str, ...] = ("robocentric", "world+oc", "scale_gauge+oc+scene50", "recommended")
+    """Filters, with modifiers, of Inverse Scaling."""
+    runs: int = 48
+    """Runs of each."""
+    steps: int = 3000
+    """Steps of every run."""
+    seed: int = 20261128
+    """Seed of the runs."""
+    chunk: int = 24
+    """Runs in one batch."""
+    out: Path = RESULTS / "long_runs.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`[scenario][filter]`: mean and median NEES and the share of lost runs `at` some steps."""
+        results = self.found()
+        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
+        for scenario in self.scenarios:
+            for name in self.filters:
+                row = results.setdefault(scenario, {}).get(name, {})
+                if any(row.get(key) != value for key, value in wanted.items()):
+                    results[scenario][name] = wanted | self._measured(scenario, name)
+                    yield results
+
+    def _measured(self, scenario: str, name: str) -> dict[str, Any]:
+        world = jaxslam.scenario(scenario, {"steps": self.steps})
+        study = jaxslam.monte_carlo(world, [name], runs=self.runs, seed=self.seed, chunk=self.chunk)
+        (found,) = jaxslam.summarise(study)["filters"].values()
+        at = np.unique(np.geomspace(FIRST, self.steps, MOST).round().astype(int)).tolist()
+        kept = {key: [found[key][k - 1] for k in at] for key in ("nees", "nees_median", "lost")}
+        seconds = found["seconds"]["run"]
+        return {"at": at, **kept, "microseconds_per_step": 1e6 * seconds / self.runs / self.steps}
+
+    def report(self, results: dict[str, Any]) -> None:
+        for scenario, filters in results.items():
+            for name, row in filters.items():
+                told = [row[key][-1] for key in ("nees", "nees_median", "lost")]
+                print(scenario, name, *told, flush=True)
+        save(drawn_of(results), self.docs / "long-runs.png")
+
+
+def drawn_of(results: dict[str, Any]) -> Figure:
+    """Mean NEES against the step, a panel for every scenario."""
+    figure = new_figure(3.4 * len(results), 3.2)
+    axes = np.atleast_1d(figure.subplots(1, len(results), sharey=True))
+    for ax, (scenario, filters) in zip(axes, results.items(), strict=True):
+        _draw(ax, filters)
+        runs = {row["runs"] for row in filters.values()}
+        ax.set_title(f"{scenario}: {WORLDS[scenario]}\n{max(runs)} runs", fontsize="medium")
+    axes[0].set_ylabel("mean NEES of the pose")
+    axes[0].legend(fontsize="small", loc="upper left")
+    return figure
+
+
+def _draw(ax: Axes, filters: dict[str, Any]) -> None:
+    ax.axhline(IDEAL, color=GREY, linewidth=0.8, label="consistent")
+    for index, (name, row) in enumerate(filters.items()):
+        nees = np.array(row["nees"], float)
+        ax.plot(row["at"], nees, **line_style(index), label=name)
+    ends = FIRST, max(row["at"][-1] for row in filters.values())
+    ax.set(xscale="log", yscale="log", xlabel="step", xlim=ends, ylim=(1, CUT))
+
+
+if __name__ == "__main__":
+    LongRuns.run()
