@@ -341,7 +341,7 @@ class Evaluation:
         told, rows = html.escape(self._told()).replace("\n", "<br>"), _rows(self)
         cells = ("".join(f"<td>{html.escape(x)}</td>" for x in row) for row in rows)
         table = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
-        notes = "<br>".join(map(html.escape, [self._counted(), _covered(self), *self.remarks]))
+        notes = "<br>".join(map(html.escape, [_counted(self), _covered(self), *self.remarks]))
         return f"<p>{told}</p>{table if self.names else ''}<p>{notes}</p>"
 
     def __getattr__(self, name: str) -> NoReturn:
@@ -350,7 +350,7 @@ class Evaluation:
 
     def __str__(self) -> str:
         table = _in_columns(*_rows(self)) if self.names else []
-        counted = [self._counted(), _covered(self)]
+        counted = [_counted(self), _covered(self)]
         return "\n".join([self._told(), "", *counted, *table, *self.remarks])
 
     def _told(self) -> str:
@@ -374,16 +374,6 @@ class Evaluation:
     def remarks(self) -> list[str]:
         """All remarks: what is missing, what was left out, what was assumed."""
         return [*_missing(self), *self.notes]
-
-    def _counted(self) -> str:
-        low, high = self.band95
-        runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
-        steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
-        return (
-            f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
-            f"{self.expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
-            f"{self.inside:.0%} of the steps are inside"
-        )
 
     @property
     def expected(self) -> str:
@@ -443,6 +433,17 @@ def _beyond_nees(evaluation: Evaluation) -> list[str]:
 
 def _p(p: float) -> str:
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+
+
+def _counted(evaluation: Evaluation) -> str:
+    low, high = evaluation.band95
+    runs = f"{evaluation.runs} run{'s' if evaluation.runs > 1 else ''}"
+    steps = f"{evaluation.steps} step{'s' if evaluation.steps > 1 else ''}"
+    return (
+        f"{runs} of {steps}; mean {evaluation.quantity} of a consistent filter "
+        f"{evaluation.expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
+        f"{evaluation.inside:.0%} of the steps are inside"
+    )
 
 
 def _missing(evaluation: Evaluation) -> list[str]:
