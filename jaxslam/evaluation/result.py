@@ -285,7 +285,6 @@ class Evaluation:
         """The content of `evaluation.json`."""
         from jaxslam._version import __version__
 
-        by_axis = {name: i for i, name in enumerate(self.names)}
         return {
             "schema": 1,
             "version": __version__,
@@ -302,10 +301,7 @@ class Evaluation:
             "verdict": self.verdict,
             "run_names": list(self.run_names),
             "lost_runs": self.lost_runs,
-            "outside3sigma": {n: float(self.outside3sigma[i]) for n, i in by_axis.items()},
-            "rmse": {n: json_numbers(self.rmse[:, i]) for n, i in by_axis.items()},
-            "sigma": {n: json_numbers(self.sigma[:, i]) for n, i in by_axis.items()},
-            "axis_verdict": {n: self.axis_verdict(i) for n, i in by_axis.items()},
+            **_by_axis(self),
             "coverage": self.coverage,
             **_beside_nees(self),
             "convention": None if self.convention is None else asdict(self.convention),
@@ -402,6 +398,17 @@ def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
             "axes": [names[i] for i in found.axes],
             "p": found.p,
         },
+    }
+
+
+def _by_axis(evaluation: Evaluation) -> dict[str, Json]:
+    places = {name: i for i, name in enumerate(evaluation.names)}
+    outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
+    return {
+        "outside3sigma": {name: float(outside[i]) for name, i in places.items()},
+        "rmse": {name: json_numbers(rmse[:, i]) for name, i in places.items()},
+        "sigma": {name: json_numbers(sigma[:, i]) for name, i in places.items()},
+        "axis_verdict": {name: evaluation.axis_verdict(i) for name, i in places.items()},
     }
 
 
