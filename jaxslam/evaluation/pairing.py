@@ -82,13 +82,17 @@ def read(place: Place) -> Log:
     """
     log = ros.read_poses(place) if isinstance(place, ros.Topic) else read_log(place)
     _check_times(place, log.times)
-    last = np.flatnonzero(np.append(np.diff(log.times) > 0, True))
+    last = _last_of_each(log.times)
     if len(last) == len(log.times):
         return log
     note = f"{len(log.times) - len(last)} stamps are doubled; of each the last pose is used"
     P = log.covariances[last] if len(log.covariances) else log.covariances
     notes = (*log.notes, note)
     return log._replace(times=log.times[last], poses=log.poses[last], covariances=P, notes=notes)
+
+
+def _last_of_each(times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+    return np.flatnonzero(np.append(np.diff(times) > 0, True))
 
 
 def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
@@ -115,6 +119,8 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
         text, rounded = _stamped_by(log.times, text)
         notes += rounded
         _check_times(run.covariance, text.times)
+        last = _last_of_each(text.times)
+        text = text._replace(times=text.times[last], covariances=text.covariances[last])
     P, used = _nearest(run, log.times, text)
     if isinstance(run.covariance, ros.Topic):
         P = _filled_in(run.covariance, P)
@@ -291,10 +297,11 @@ def _truths(
             f"and {np.degrees(wrong[1]):.2g}° (median), {most:.2g} σ"
         )
         return _some(run, log, truth, whole), log.poses, [note] if most > 0.01 else []
-    if gap > SPARSE * step and len(np.unique(of)) < LEAST_SHARE * len(times):
+    few = len(np.unique(of)) < LEAST_SHARE * len(times)
+    if gap > SPARSE * step and (few or off > 1e-6 * step):
         rough = (_interpolation_error(log.times, log.poses) / sigma)[: 2 if oriented else 1].max()
         told = f"the truth has a pose every {gap:.3g} s and the estimate every {step:.3g} s"
-        if rough > DENSE:
+        if rough > DENSE and few:
             raise ValueError(
                 f"{run.truth}: {told}, at other stamps, and between them the estimate is known to "
                 f"{rough:.2g} of its σ only; log it at the stamps of the truth, or take a truth "
@@ -302,7 +309,8 @@ def _truths(
             )
         note = f"{told}: compared at the stamps of the truth, to {rough:.2g} σ of the estimate"
         moved, true = _at_stamps_of_truth(log, times, poses)
-        return _some(run, log, truth, true), moved, [note]
+        if rough <= DENSE:
+            return _some(run, log, truth, true), moved, [note]
     return _some(run, log, truth, nearest), log.poses, []
 
 

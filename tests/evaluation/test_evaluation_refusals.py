@@ -258,6 +258,17 @@ def nanoseconds(t):
     return f"{round(t * 1e9)}"
 
 
+def of_text(name, text):
+    """A run of which one file is another."""
+
+    def read(folder):
+        run = one_run(folder / "run")
+        (run / name).write_text(text)
+        return evaluate_log(run)
+
+    return read
+
+
 def a_part(folder):
     run = one_run(folder)
     lines = (run / "truth.txt").read_text().splitlines()
@@ -303,6 +314,30 @@ OF_FOLDERS = [
     (
         shown(lambda t: f"{1.4e9 + (t - 1.4e9) % 2:.9f}", "truth.txt"),
         r"times decrease from 1400000001\.900 to 1400000000\.000 s; expected one run",
+    ),
+    (
+        of_text("estimate.txt", "est_err_type,t,x,y,z,pxx,pyy,pzz\ntype3,0,1,1,1,1,1,1\n"),
+        r"estimate\.txt: est_err_type is type3; expected one of type1, type2, type5",
+    ),
+    (
+        of_text("estimate.txt", "#%FORMAT SQUARE/0.3\n#%TIMESTAMP_UNIT weeks\n" + "1 " * 29),
+        r"the header TIMESTAMP_UNIT is weeks; expected seconds or milliseconds or",
+    ),
+    (
+        of_text("estimate.txt", "0 1 2 3 4 5\n"),
+        r"estimate\.txt, line 1: 6 columns are no known format; expected eight finite numbers",
+    ),
+    (
+        of_text("truth.txt", "a,t,b\n0,1,2\n"),
+        r"truth\.txt, line 2: 3 columns \(a, t, b\) are no known format",
+    ),
+    (
+        of_text("truth.txt", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"),
+        r"has 40 poses and .*truth\.txt 1, and not both have stamps: .*give times",
+    ),
+    (
+        shown(lambda t: f"{1.4e9 + 10 * (t - 1.4e9) + 0.03:.9f}", "truth.txt"),
+        r"known to \d+ of its σ only; log it at the stamps of the truth",
     ),
     (a_part, r"only 15 can be compared.* half the lines"),
     (frames(",1\n", ",yes\n"), r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),

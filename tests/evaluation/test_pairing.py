@@ -1,0 +1,136 @@
+"""Which true pose and which covariance belong to an estimate, and what has a degree of freedom."""
+
+import numpy as np
+import pytest
+from log_faults import flight
+from logs import logged, one_run, planar
+from scipy import stats
+
+import jaxslam
+from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, evaluate_poses
+from jaxslam.evaluation.convention import write_covariances
+from jaxslam.io.tum import write_tum
+
+LOG = flight(np.random.default_rng(4), 1, 30)
+WANTED = evaluate_poses(LOG.estimates, LOG.covariances, LOG.truths, LOG.convention).nees
+
+
+def files(folder, true=slice(None), own=slice(None), late=0.0):
+    """One run, of these of its hundred true poses a second and of its ten estimates."""
+    times = LOG.times[own]
+    write_tum(folder / "estimate.txt", times, LOG.estimates[0, own])
+    write_covariances(folder / "covariance.txt", times, LOG.covariances[0, own], LOG.convention)
+    write_tum(folder / "truth.txt", LOG.dense_times[true] + late, LOG.dense[0, true])
+    return folder
+
+
+@pytest.mark.parametrize("true", [slice(None), slice(0, None, 3), slice(1, None, 2)])
+def test_a_truth_at_other_stamps_is_interpolated(true, tmp_path):
+    found = evaluate_log(files(tmp_path, true))
+    there = found.logged[0]
+    assert there.sum() >= 29
+    wanted = WANTED[0, 30 - found.steps :]
+    np.testing.assert_allclose(found.nees[0, there], wanted[there], rtol=0.02)
+    assert any("the truth is interpolated" in note for note in found.notes) == (true.step is not None)
+
+
+def test_no_truth_is_made_up_across_a_hole_or_beyond_the_ends(tmp_path):
+    true = np.r_[5:98, 132:248]
+    found = evaluate_log(files(tmp_path, true))
+    without = np.flatnonzero(~found.logged[0]) + 1  # of the first is no step
+    assert set(without) == {10, 11, 12, 13, 25, 26, 27, 28, 29}
+    assert "10 of 30 poses have no truth" in str(found)
+
+
+def test_where_the_truth_is_rare_its_stamps_are_those_that_are_compared(tmp_path):
+    """Twenty true poses, of 300 estimates that are accurate enough to be interpolated."""
+    times, dense = LOG.dense_times, LOG.dense[0]
+    rows = np.arange(4, 300, 15)
+    write_tum(tmp_path / "estimate.txt", times, dense)
+    P = np.tile(1e-4 * np.eye(6), (300, 1, 1))
+    write_covariances(tmp_path / "covariance.txt", times, P, LOG.convention)
+    halfway = (dense[rows, :3, 3] + dense[rows + 1, :3, 3]) / 2
+    truth = dense[rows].copy()
+    truth[:, :3, 3] = halfway + np.array([0.01, 0.0, 0.0])
+    write_tum(tmp_path / "truth.txt", times[rows] + 0.005, truth)
+    found = evaluate_log(tmp_path, stated={"error": "split", "axes": "world"}, axes_used="x,y,z")
+    assert found.logged.sum() == 20
+    np.testing.assert_allclose(found.errors[found.logged], [[0.01, 0.0, 0.0]] * 20, atol=1e-4)
+    assert "compared at the stamps of the truth" in str(found)
+
+
+@pytest.mark.parametrize("value", [-1.0, 1e12, 1.797e308])
+def test_axes_of_unknown_variance_have_no_degree_of_freedom(value, tmp_path):
+    T, P, truth, nees = planar(runs=1, steps=30)
+    times, P = np.arange(30) / 10, P[0].copy()
+    P[:, [2, 3, 4], [2, 3, 4]] = value
+    write_tum(tmp_path / "estimate.txt", times, T[0])
+    write_tum(tmp_path / "truth.txt", times, truth[0])
+    rows = np.column_stack([times, P[:, *np.triu_indices(6)]])
+    np.savetxt(tmp_path / "covariance.txt", rows, header="error=split axes=world")
+    found = evaluate_log(tmp_path)
+    assert found.names == ("x", "y", "rz")
+    np.testing.assert_allclose(found.nees, nees, rtol=1e-4)
+
+
+def test_what_a_first_pose_knows_exactly_has_no_degree_of_freedom():
+    """Position and yaw; roll and pitch have a σ, and the pose no part in the NEES."""
+    split = Convention("split", "world")
+    T, P, truth = logged(split, runs=20)
+    P, known = P.copy(), [0, 1, 2, 5]
+    P[:, 0, known], P[:, 0, :, known] = 0.0, 0.0
+    truth[:, 0] = T[:, 0]
+    found = evaluate_poses(T, P, truth, split)
+    assert "the first step is known exactly, and left out" in found.notes
+    np.testing.assert_allclose(
+        found.nees, evaluate_poses(T[:, 1:], P[:, 1:], truth[:, 1:], split).nees
+    )
+    truth[3, 0, 0, 3] += 0.01
+    with pytest.raises(ValueError, match="run 3, step 0 has variance 0"):
+        evaluate_poses(T, P, truth, split)
+
+
+def test_degrees_of_freedom_by_step_are_brought_to_one_by_their_probability():
+    rng = np.random.default_rng(0)
+    dof = rng.integers(1, 9, (20, 30))
+    nis = rng.chisquare(dof)
+    nis[0, 0], nis[3, 5] = 3e4, np.nan  # beyond all probability, and not logged
+    found = evaluate_nees(nis, dof, quantity="NIS")
+    one = int(np.median(dof[~np.isnan(nis)]))
+    wanted = stats.chi2.isf(stats.chi2.sf(nis, dof), one)
+    wanted[0, 0] = 3e4 * one / dof[0, 0]
+    assert found.dof == one
+    np.testing.assert_allclose(found.nees, wanted, rtol=1e-6)
+    assert "degrees of freedom are 1 to 8" in str(found)
+    same = evaluate_nees(nis, np.full(nis.shape, 3))
+    np.testing.assert_array_equal(same.nees, evaluate_nees(nis, 3).nees)
+
+
+def test_innovations_of_what_was_not_measured_count_for_nothing():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(20, 30, 3, 3)) + 2 * np.eye(3)
+    S, z = root @ np.swapaxes(root, 2, 3), (root @ rng.normal(size=(20, 30, 3, 1)))[..., 0]
+    seen = rng.random(z.shape) < 0.7
+    seen[..., 0] |= ~seen.any(axis=-1)
+    wanted = np.empty((20, 30))
+    for place in np.ndindex(20, 30):
+        own = np.flatnonzero(seen[place])
+        nis = z[place][own] @ np.linalg.solve(S[place][np.ix_(own, own)], z[place][own])
+        wanted[place] = stats.chi2.isf(stats.chi2.sf(nis, len(own)), 2)
+    without = np.where(seen, z, np.nan), np.where(seen[..., None] & seen[..., None, :], S, np.nan)
+    found = jaxslam.evaluate(*without, quantity="NIS")
+    assert found.dof == 2
+    np.testing.assert_allclose(found.nees, wanted, rtol=1e-6)
+
+
+def test_of_doubled_stamps_the_last_pose_is_used(tmp_path):
+    folder = one_run(tmp_path)
+    wanted = evaluate_log(folder).nees
+    for name in ("estimate.txt", "covariance.txt"):
+        title, *rows = (folder / name).read_text().splitlines()
+        spoilt = [" ".join([row.split()[0], *["1.0"] * (len(row.split()) - 1)]) for row in rows]
+        both = [x for pair in zip(spoilt, rows, strict=True) for x in pair]
+        (folder / name).write_text("\n".join([title, *both]) + "\n")
+    found = evaluate_log(folder)
+    np.testing.assert_allclose(found.nees, wanted)
+    assert "40 stamps are doubled" in str(found)
