@@ -10,16 +10,19 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from jaxslam._runtime.files import Json, json_numbers, write_json
+from jaxslam._runtime.files import Json, json_numbers, write_atomically, write_json
 from jaxslam.cli.consistency import ConsistencyOptions
 from jaxslam.consistency.suite import SUITE, SuiteScenario, read_suite, write_suite
 from jaxslam.consistency.summary import summarise
 from jaxslam.evaluation import CHOICES, Convention, Evaluation, evaluate_poses
 from jaxslam.evaluation.inputs import read_pose_log
 from jaxslam.evaluation.log_files import evaluate_log, named
+from jaxslam.evaluation.result import latex
 
 RIVALS = ("recommended", "robocentric", "invariant", "world")
-_OF_ONE_LOG = ("covariance", "truth", "estimate", "truth_sigma", "innovations", "nis")
+_OF_ONE_LOG = (
+    "covariance", "truth", "estimate", "truth_sigma", "innovations", "nis", "against",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,9 @@ class EvaluateOptions:
     """Whether the covariance is marginal (the default) or given the scale of the world; with given,
     NEES is computed at that scale."""
     align: Annotated[str, tyro.conf.arg(metavar="NAME")] = "none"
-    """How the estimate is aligned with the truth: none, yaw (position and yaw, which no camera with
-    an IMU knows), se3 or sim3. The first pose is used where its σ is small, otherwise all poses."""
+    """How the estimate is aligned with the truth: none, first (at the first pose), yaw (position
+    and yaw, which no camera with an IMU knows), se3 or sim3. The last three use the first pose
+    where its σ is small, otherwise all poses."""
     time_offset: Annotated[str, tyro.conf.arg(metavar="SECONDS|auto")] = "0"
     """By how much the estimate's stamps are late; auto finds it by the rotations of both."""
     axes_used: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
@@ -73,6 +77,11 @@ class EvaluateOptions:
     """Treat the errors in a CSV or npz file as innovations, and the covariances as theirs."""
     out: Path = Path("results")
     """Output folder for evaluation.json and evaluation.png."""
+    against: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Another filter's log of the same run, with its covariances, in place of a truth: the
+    covariances of both are added."""
+    latex: bool = False
+    """Also write evaluation.tex, the table for LaTeX."""
     pdf: bool = False
     """Also write evaluation.pdf, one column (3.4 in) wide for print, with embedded fonts."""
 
@@ -104,7 +113,10 @@ class EvaluateOptions:
         if self.pdf:
             plot_evaluation(found, self.out / "evaluation.pdf", column=True)
         print(found)
-        too = " and evaluation.pdf" if self.pdf else ""
+        if self.latex:
+            with write_atomically(self.out / "evaluation.tex") as path:
+                path.write_text(latex(found), encoding="utf-8")
+        too = " and evaluation.pdf" * self.pdf + " and evaluation.tex" * self.latex
         print(f"wrote {written} and, beside it, evaluation.png{too}")
 
     def _stated(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ from jaxslam.evaluation.convention import (
 )
 from jaxslam.evaluation.inputs import MOST, Poses, exactly_known
 
-ALIGNMENTS = ("none", "yaw", "se3", "sim3")
+ALIGNMENTS = ("none", "first", "yaw", "se3", "sim3")
 MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
@@ -259,6 +259,7 @@ def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.n
 
 
 BY_FIRST = "aligned at the first pose, which the covariances treat as known"
+BY_ANY = "aligned at the first pose, whose covariance is added to the others'"
 BY_SMALL = "aligned at the first pose, whose σ is small beside the others'"
 TO_ALL = "aligned with all positions; the joint covariance is projected to that gauge"
 INDEPENDENT = (
@@ -283,17 +284,19 @@ class Aligned(NamedTuple):
 def aligned(
     poses: Poses, convention: Convention, align: str, axes: Axes | Bool[np.ndarray, " t"]
 ) -> Aligned:
-    """The estimates aligned by `none`, `yaw` (and position), `se3` or `sim3`.
+    """The estimates aligned by `none`, `first`, `yaw` (and position), `se3` or `sim3`.
 
     Where the first pose is known, with no variance on these `axes` of the covariances, or a small
-    one, it is by the first pose; else to all positions. Raises ValueError for what does not go
-    together.
+    one, it is by the first pose, and with `first` in any case; else to all positions. Raises
+    ValueError for what does not go together.
     """
     given = convention.scale == "given"
     if align == "none":
         return Aligned(poses, given)
     first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
     known = exactly_known(first[:, axes][:, :, axes]).all()
+    if align == "first" and not known:
+        return Aligned(_each_run(poses, convention, _by_any_first), given, (BY_ANY,))
     if known or (not given and align != "sim3" and _small_at_first(poses, convention, align)):
         by_first = _each_run(poses, convention, partial(_by_first, yaw=align == "yaw"))
         return Aligned(by_first, given or align == "sim3", (BY_FIRST if known else BY_SMALL,))
@@ -361,6 +364,17 @@ def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
             if np.median(variance) > SMALL**2 * np.median(own):
                 return False
     return True
+
+
+def _by_any_first(run: Poses, convention: Convention) -> Poses:
+    """Align the first pose, whose error then moves all others, `e_k − U_k U₀⁻¹ e₀`: its covariance
+    is added to theirs as if both were independent."""
+    P = converted(run.covariances, run.estimates, convention, _SPLIT)
+    U = gauge_directions(run.estimates, "se3")
+    J = U[1:] @ np.linalg.inv(U[0])
+    P[1:] += J @ P[0] @ np.swapaxes(J, 1, 2)
+    P = converted(P, run.estimates, _SPLIT, convention)
+    return _by_first(run._replace(covariances=P, joint=None), convention, yaw=False)
 
 
 def _by_first(run: Poses, convention: Convention, *, yaw: bool) -> Poses:

@@ -141,6 +141,7 @@ def _w_first(
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
                 f"the {name} read as qw qx qy qz {_instead(found, fixed)}; write qx qy qz qw, or "
                 "name the columns",
+                _nees(fixed),
             )
     return None
 
@@ -186,6 +187,7 @@ def _worlds(
         "estimate and truth are not in one world",
         f"positions differ by {rms:.3g} m (RMS) and by {left:.3g} m once aligned, by "
         f"{np.degrees(np.median(angles)):.3g}°: with --align {by} {_instead(found, fixed)}",
+        _nees(fixed),
     )
 
 
@@ -204,9 +206,8 @@ def _tilt(
         if other == "yaw"
         else "the verticals of both worlds differ"
     )
-    return Mistake(
-        f"an alignment by {align}", f"{why}: with --align {other} {_instead(found, fixed)}"
-    )
+    told = f"{why}: with --align {other} {_instead(found, fixed)}"
+    return Mistake(f"an alignment by {align}", told, _nees(fixed))
 
 
 def _mounting(
@@ -236,6 +237,7 @@ def _mounting(
         f"{' and '.join(parts)} between them, the same at every pose: without it "
         f"{_instead(found, best)}{_by_part(compared, moved, align, found)}; give the truth of the "
         "body that is estimated",
+        _nees(best),
     )
 
 
@@ -375,4 +377,5 @@ def _half_angles(
         "σ of all rotations is half of the right one, and that of positions right, as if the "
         f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
         f"header {_instead(found, fixed)}. If they are of angles, the filter is over-confident",
+        _nees(fixed),
     )

@@ -14,7 +14,7 @@ from jaxslam.evaluation.causes import suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
-from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run
+from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run, with_other
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, described, evaluate, evaluate_nees
 from jaxslam.evaluation.sanity_checks import Mistake
@@ -51,6 +51,7 @@ def evaluate_log(
     truth_sigma: Sequence[float] | None = None,
     innovations: str | Path | None = None,
     time_offset: float | str = 0.0,
+    against: str | Path | None = None,
 ) -> Evaluation:
     """The verdict on what a file or a folder holds.
 
@@ -59,7 +60,9 @@ def evaluate_log(
     itself, and `truth`, or a folder. A folder has a run of `estimate.txt`, `covariance.txt` and
     `truth.txt`, or one per sub-folder, or trajectories with their covariances beside one truth, or
     ROS bags. The topics of a bag are named by `estimate` and `truth` where several fit. The stamps
-    of the estimate are late by the `time_offset`, s, or by what its rotations say (`auto`). Where
+    of the estimate are late by the `time_offset`, s, or by what its rotations say (`auto`). In
+    place of a truth it may be compared `against` another log of the same run, whose covariances are
+    added as if the errors of both were independent. Where
     the tracker's `frames.csv` is beside a trajectory, its longest map is evaluated, without frames
     that are lost or whose unit was not fixed yet. What is `stated` of the convention (`error`,
     `axes`, `order`,
@@ -75,6 +78,7 @@ def evaluate_log(
         own = evaluate_log(
             source, covariance=covariance, truth=truth, estimate=estimate, stated=stated,
             align=align, axes_used=axes_used, truth_sigma=truth_sigma, time_offset=time_offset,
+            against=against,
         )  # fmt: skip
         told = f"{beside.headline.partition(':')[0]} (of innovations); {advice(beside, own)}"
         return described(own, notes=(*own.notes, told))
@@ -83,6 +87,9 @@ def evaluate_log(
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
+    if against is not None and truth is not None:
+        raise ValueError("give --truth or --against, not both")
+    truth = against if truth is None else truth
     beside = {"covariance": covariance, "truth": truth, "estimate": estimate}
     binary = source.suffix in ARRAYS
     if binary or (source.is_file() and _is_table(source, beside)):
@@ -98,7 +105,7 @@ def evaluate_log(
             f"{source}: innovations must be in an npz or CSV file, not in a trajectory"
         )
     runs = runs_of(source, covariance, truth, estimate)
-    return evaluate_runs(source, runs, stated, how, time_offset)
+    return evaluate_runs(source, runs, stated, how, time_offset, against=against is not None)
 
 
 def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
@@ -252,13 +259,17 @@ def evaluate_runs(
     stated: dict[str, str],
     how: PoseOptions,
     time_offset: float | str = 0.0,
+    *,
+    against: bool = False,
 ) -> Evaluation:
     """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
-    `how` are the options of `evaluate_poses`; for the `time_offset` see `evaluate_log`.
+    `how` are the options of `evaluate_poses`; for the others see `evaluate_log`.
     """
     read = [read_run(run, time_offset) for run in runs]
     convention = _convention_of(read, stated)
+    if against:
+        read = [with_other(one, convention) for one in read]
     for one in read:
         if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
@@ -286,8 +297,12 @@ def evaluate_runs(
                 f"the stamps of the estimate are {1e3 * offset:.1f} ± {1e3 * sigma:.1g} ms late, "
                 f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
                 f"instead of {before:.4g}",
+                after,
             )
             found = described(found, causes=(clock, *fixed.causes))
+        found = described(found, time_offset=late)
+    elif time_offset == "auto":
+        found = described(found, time_offset=_all_runs(read))
     told += (
         *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
@@ -313,6 +328,12 @@ def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None
     is not beyond doubt, or the filter is not over-confident."""
     if not suspect(found):
         return None
+    late = _all_runs(read)
+    return late if late is not None and Offset(*late).found else None
+
+
+def _all_runs(read: list[RunLog]) -> tuple[float, float] | None:
+    """The mean offset of the runs' clocks, and its σ; None where rotations do not tell it."""
     offsets = [one.offset for one in read[:LOOKED_AT]]
     late, sigma = (
         np.array([(x.seconds, x.sigma) for x in offsets if x is not None]).reshape(-1, 2).T
@@ -320,8 +341,7 @@ def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None
     if not len(late):
         return None
     weight = 1 / np.maximum(sigma, 1e-9) ** 2
-    all_runs = Offset(float(late @ weight / weight.sum()), float(weight.sum() ** -0.5))
-    return (all_runs.seconds, all_runs.sigma) if all_runs.found else None
+    return float(late @ weight / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _remarks(read: list[RunLog]) -> Iterator[str]:

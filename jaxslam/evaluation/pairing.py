@@ -133,8 +133,11 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     raw, times = log, log.times
     if time_offset == "auto":
         found = clock_offset(times, log.poses, truth.times, truth.poses) if oriented else None
-        time_offset = 0.0 if found is None else found.seconds
-        notes.append(f"the estimate is taken to be {1e3 * time_offset:.1f} ms late, as found")
+        time_offset = found.seconds if found is not None and found.found else 0.0
+        told = (
+            f"taken to be {1e3 * time_offset:.1f} ms late, as found" if time_offset else "in time"
+        )
+        notes.append(f"the estimate is {told}")
     times = times - float(time_offset)
     log = log._replace(times=times)
     true, estimates, more = _truths(run, log, truth, P, Convention(**text.said), oriented=oriented)
@@ -163,6 +166,25 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
 
 def _folder(place: Place) -> Path:
     return place.parent
+
+
+def with_other(read: RunLog, convention: Convention) -> RunLog:
+    """The run compared with another estimate in place of its truth, whose covariances are added.
+
+    Raises ValueError where that has none.
+    """
+    other = read.raw[1]
+    if not len(other.covariances):
+        raise ValueError(f"{read.run.truth} has no covariances; --against needs a log with its own")
+    at, of = associated(read.times, other.times)
+    P = np.full_like(read.covariances, np.nan)
+    said = Convention(**other.said)
+    P[at] = converted(other.covariances[of], other.poses[of], said, convention)
+    note = (
+        f"compared with {read.run.truth}, whose covariances are added: if the errors of both are "
+        "alike, as of one sensor, their difference is smaller than this says"
+    )
+    return read._replace(covariances=read.covariances + P, notes=(*read.notes, note))
 
 
 def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
@@ -283,7 +305,7 @@ def _truths(
     nearest[at[order]] = poses[of[order]]
     if len(times) < 3 or not log.stamped:
         return _some(run, log, truth, nearest), log.poses, []
-    off = np.abs(log.times[at] - times[of]).max(initial=0.0)
+    off = np.abs(log.times[at] - times[of]).max() if len(at) else np.inf
     wrong = _interpolation_error(times, poses)
     sigma = _sigmas(log, P, convention)
     most = (wrong / sigma)[: 2 if oriented else 1].max()

@@ -92,13 +92,13 @@ def evaluate_poses(
     `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a run together, (runs,
     6 steps, 6 steps), of the errors that the `convention` names. Where the estimate is of another
     world, `align` it by `yaw` (and position), `se3` or `sim3`: at the first pose, if its σ is
-    small, else to all positions. The covariance is transported with it. Given the scale of the
-    world, or with `sim3`, NEES is at one scale a run, and the drift of scale is tested beside it.
-    Of a robot that moves in a plane `axes_used` are those that it estimates, as
-    ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured
-    has a `truth_sigma`, of position (m) and orientation (degrees), along the axes of the body,
-    which is added to the covariances. Whether another convention would make the data consistent is
-    tried too. Raises ValueError, naming run and step.
+    small, else to all positions; by `first` at the first pose in any case. The covariance is
+    transported with it. Given the scale of the world, or with `sim3`, NEES is at one scale a run,
+    and the drift of scale is tested beside it. Of a robot that moves in a plane `axes_used` are
+    those that it estimates, as ("x", "y", "rz"); by default all whose errors are not zero
+    throughout. A truth that is measured has a `truth_sigma`, of position (m) and orientation
+    (degrees), along the axes of the body, which is added to the covariances. Whether another
+    convention would make the data consistent is tried too. Raises ValueError, naming run and step.
     """
     stated = convention or Convention()
     if not isinstance(stated, Convention):
@@ -117,7 +117,9 @@ def evaluate_poses(
 
     told = tuple(causes(poses, stated, align, found, compared))
     if not told and identified.doubtful and not identified.stands:
-        told = (Mistake("the convention of the covariances is another", identified.sentence),)
+        best = identified.nees[identified.consistent[0]]
+        what = "the convention of the covariances is another"
+        told = (Mistake(what, identified.sentence, best),)
     how = {"times": at, "timed": times is not None, "identified": identified}
     return described(found, causes=told, **how)
 

@@ -117,6 +117,8 @@ class Evaluation:
     """The σ of the truth that the covariances hold too, m and degrees; None of an exact one."""
     run_names: tuple[str, ...] = ()
     """The names of the runs, where they have any."""
+    time_offset: tuple[float, float] | None = None
+    """By how many seconds the stamps of the estimate are late and its σ, where that was found."""
     causes: tuple[Mistake, ...] = ()
     """What lies between the logs and makes NEES wrong (`jaxslam.evaluation.causes`)."""
     whitened: PerAxis | None = None
@@ -334,11 +336,7 @@ class Evaluation:
         return str(self)
 
     def _repr_html_(self) -> str:
-        told, rows = html.escape(self._told()).replace("\n", "<br>"), _rows(self)
-        cells = ("".join(f"<td>{html.escape(x)}</td>" for x in row) for row in rows)
-        table = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
-        notes = "<br>".join(map(html.escape, [_counted(self), _covered(self), *self.remarks]))
-        return f"<p>{told}</p>{table if self.names else ''}<p>{notes}</p>"
+        return _html(self, self._told())
 
     def __getattr__(self, name: str) -> NoReturn:
         meant = suggestion(name, dir(type(self)))
@@ -387,9 +385,16 @@ def described(found: Evaluation, **words: Any) -> Evaluation:
 
 
 def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
-    """The mean errors and correlations as JSON has them."""
+    """What is said beside NEES, as JSON has it."""
     names, bias, found = evaluation.names, evaluation.bias, evaluation.correlation
+    offset = evaluation.time_offset
     return {
+        "effective_samples": evaluation._of_nees.get("effective"),
+        "time_offset": None if offset is None else {"seconds": offset[0], "sigma": offset[1]},
+        "causes": [
+            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
+            for x in evaluation.mistakes
+        ],
         "bias": bias
         and {n: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, n in enumerate(names)},
         "correlation": found
@@ -399,6 +404,29 @@ def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
             "p": found.p,
         },
     }
+
+
+def _html(evaluation: Evaluation, told: str) -> str:
+    rows = _rows(evaluation) if evaluation.names else []
+    cells = ("".join(f"<td>{html.escape(x)}</td>" for x in row) for row in rows)
+    table = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>" if rows else ""
+    notes = [_counted(evaluation), _covered(evaluation), *evaluation.remarks]
+    told = html.escape(told).replace("\n", "<br>")
+    return f"<p>{told}</p>{table}<p>{'<br>'.join(map(html.escape, notes))}</p>"
+
+
+def latex(evaluation: Evaluation) -> str:
+    """The table of axes for LaTeX (booktabs), and the verdict with its exact band as a comment."""
+    first, *rows = _rows(evaluation)
+    symbols = {"σ": r"$\sigma$", "×": r"$\times$", "±": r"$\pm$", "%": r"\%", "∞": r"$\infty$"}
+    lines = [r"\begin{tabular}{l" + "r" * (len(first) - 1) + "}", r"\toprule"]
+    for row in (first, *rows):
+        line = " & ".join(row)
+        for symbol, name in symbols.items():
+            line = line.replace(symbol, name)
+        lines += [line + r" \\", r"\midrule"] if row is first else [line + r" \\"]
+    comments = [f"% {line}" for line in (*evaluation._told().splitlines(), _counted(evaluation))]
+    return "\n".join([*comments, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
 def _by_axis(evaluation: Evaluation) -> dict[str, Json]:

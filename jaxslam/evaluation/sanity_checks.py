@@ -56,6 +56,8 @@ class Mistake(NamedTuple):
     """A name in a few words."""
     told: str
     """A sentence: where, by how much, and what to do."""
+    nees: float | None = None
+    """The mean NEES without it, where that was computed."""
 
 
 class Logged(NamedTuple):

@@ -271,7 +271,9 @@ def _of_one_run(found: Verdict, nees: PerStep, whitened: PerAxis, dof: int) -> V
     one = one_run(whitened[0]) if whitened.shape[-1] else one_run_of_nees(nees[0], dof)
     found |= {"effective": one.samples}
     if not one.over_confident:
-        return found
+        # A part of the error that never changes may hide the rest of its variance.
+        right = found["word"] in ("consistent", "under-confident")
+        return found | {"word": "cannot tell"} if right else found
     return found | {
         "word": "over-confident",
         "nees": found["mean"]["nees"],

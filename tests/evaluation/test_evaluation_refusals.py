@@ -103,7 +103,7 @@ OF_POSES = [
         poses(T, POSE_P, TRUTH, Convention(scale="given"), align="se3"),
         "--align sim3, or se3 if the first covariance is zero",
     ),
-    (poses(align="rigid"), "unknown align 'rigid'; known: none, yaw, se3, sim3"),
+    (poses(align="rigid"), "unknown align 'rigid'; known: none, first, yaw, se3, sim3"),
     (poses(*STILL, np.tile(np.eye(4), (40, 6, 1, 1)), align="sim3"), "coincide"),
 ]
 

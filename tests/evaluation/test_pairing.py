@@ -31,7 +31,9 @@ def test_a_truth_at_other_stamps_is_interpolated(true, tmp_path):
     assert there.sum() >= 29
     wanted = WANTED[0, 30 - found.steps :]
     np.testing.assert_allclose(found.nees[0, there], wanted[there], rtol=0.02)
-    assert any("the truth is interpolated" in note for note in found.notes) == (true.step is not None)
+    assert any("the truth is interpolated" in note for note in found.notes) == (
+        true.step is not None
+    )
 
 
 def test_no_truth_is_made_up_across_a_hole_or_beyond_the_ends(tmp_path):
