@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import long_runs
 import numpy as np
@@ -33,7 +34,7 @@ def test_the_mean_is_drawn_of_every_filter():
 
 @pytest.mark.slow
 def test_what_was_measured_is_not_measured_again(tmp_path):
-    few = {"scenarios": ("laps-thrown",), "filters": ("robocentric",), "steps": 12}
+    few: dict[str, Any] = {"scenarios": ("laps-thrown",), "filters": ("robocentric",), "steps": 12}
     study = long_runs.LongRuns(**few, runs=2, chunk=2, out=tmp_path / "x.json", docs=tmp_path)
     study()
     row = json.loads((tmp_path / "x.json").read_text())["laps-thrown"]["robocentric"]
