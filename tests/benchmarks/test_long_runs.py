@@ -33,8 +33,10 @@ def test_the_mean_is_drawn_of_every_filter():
 
 @pytest.mark.slow
 def test_what_was_measured_is_not_measured_again(tmp_path):
-    few = {"scenarios": ("laps-thrown",), "filters": ("robocentric",), "steps": 12}
-    study = long_runs.LongRuns(**few, runs=2, chunk=2, out=tmp_path / "x.json", docs=tmp_path)
+    study = long_runs.LongRuns(
+        scenarios=("laps-thrown",), filters=("robocentric",), runs=2, steps=12, chunk=2,
+        out=tmp_path / "x.json", docs=tmp_path,
+    )  # fmt: skip
     study()
     row = json.loads((tmp_path / "x.json").read_text())["laps-thrown"]["robocentric"]
     assert row["at"] == [10, 11, 12]
