@@ -334,12 +334,11 @@ def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None
 
 def _all_runs(read: list[RunLog]) -> tuple[float, float] | None:
     """The mean offset of the runs' clocks, and its σ; None where rotations do not tell it."""
-    offsets = [one.offset for one in read[:LOOKED_AT]]
-    late, sigma = (
-        np.array([(x.seconds, x.sigma) for x in offsets if x is not None]).reshape(-1, 2).T
-    )
-    if not len(late):
+    told = (one.offset for one in read[:LOOKED_AT])
+    offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
+    if not offsets:
         return None
+    late, sigma = np.array(offsets).T
     weight = 1 / np.maximum(sigma, 1e-9) ** 2
     return float(late @ weight / weight.sum()), float(weight.sum() ** -0.5)
 

@@ -309,7 +309,7 @@ def _truths(
     wrong = _interpolation_error(times, poses)
     sigma = _sigmas(log, P, convention)
     most = (wrong / sigma)[: 2 if oriented else 1].max()
-    if off > 1e-6 * max(gap, step) and (most <= DENSE or not len(at)) and gap <= SPARSE * step:
+    if off > 1e-6 * max(gap, step) and most <= DENSE and gap <= SPARSE * step:
         whole = interpolated(times, poses, log.times)
         # Not across a hole.
         after = np.clip(np.searchsorted(times, log.times), 1, len(times) - 1)

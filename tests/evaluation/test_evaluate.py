@@ -379,7 +379,7 @@ def test_every_option_of_the_command_is_one_of_the_evaluation(tmp_path, monkeypa
     given: dict[str, Any] = {
         "covariance": Path("c.txt"), "truth": "t.txt", "estimate": "/odom", "align": "sim3",
         "axes_used": "x,rz", "truth_sigma": (0.05, 1.0), "innovations": Path("i.npz"),
-        "time_offset": 0.02,
+        "time_offset": 0.02, "against": Path("b.csv"),
     }  # fmt: skip
     stated = {"error": "left", "axes": "body", "order": "rotation-first", "scale": "given"}
     asked = {}
