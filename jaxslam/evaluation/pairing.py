@@ -31,6 +31,8 @@ from jaxslam.io.logs.log import Log, check_seconds, interpolated
 Place: TypeAlias = Path | ros.Topic
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
+BACK = 0.01
+"""The largest share of stamps that may go back in time, and are then left out."""
 DENSE = 0.3
 """The largest error of interpolation, in σ of the estimate, of a truth that is interpolated."""
 SPARSE = 3.0
@@ -81,14 +83,20 @@ def read(place: Place) -> Log:
     Raises ValueError, naming the place.
     """
     log = ros.read_poses(place) if isinstance(place, ros.Topic) else read_log(place)
+    back = log.times < np.maximum.accumulate(log.times)
+    if 0 < back.sum() <= BACK * len(back):
+        log = _of_rows(log, ~back, f"{back.sum()} stamps go back in time, and are left out")
     _check_times(place, log.times)
     last = _last_of_each(log.times)
-    if len(last) == len(log.times):
-        return log
-    note = f"{len(log.times) - len(last)} stamps are doubled; of each the last pose is used"
-    P = log.covariances[last] if len(log.covariances) else log.covariances
-    notes = (*log.notes, note)
-    return log._replace(times=log.times[last], poses=log.poses[last], covariances=P, notes=notes)
+    doubled = len(log.times) - len(last)
+    told = f"{doubled} stamps are doubled; of each the last pose is used"
+    return _of_rows(log, last, told) if doubled else log
+
+
+def _of_rows(log: Log, rows: np.ndarray, note: str) -> Log:
+    P = log.covariances[rows] if len(log.covariances) else log.covariances
+    times, poses, notes = log.times[rows], log.poses[rows], (*log.notes, note)
+    return log._replace(times=times, poses=poses, covariances=P, notes=notes)
 
 
 def _last_of_each(times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
