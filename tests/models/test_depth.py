@@ -11,6 +11,8 @@ from scipy import integrate
 
 import jaxslam
 from jaxslam import InverseDepth
+from jaxslam.filters.remedies.gauge import act
+from jaxslam.geometry import identity
 
 
 @pytest.mark.parametrize(("near", "far"), [(1.0, 6.0), (5.0, 50.0), (2.0, 2.1)])
@@ -84,6 +86,21 @@ def test_where_a_common_error_walks_depths_scatter_as_their_mean_does():
     )
     np.testing.assert_allclose(one, [0.2, 0.1], rtol=1e-6)
     np.testing.assert_allclose(other, one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_no_unit_of_length_is_in_a_walk(geometry):
+    """All lengths enlarged, it stays what it is: a share of the σ of a prior."""
+    of = Case("matched" if geometry.name == "planar" else "matched-6dof", steps=2, landmarks=2)
+    slam = of.filter("scale_gauge+oc+scene50+walk3")
+    state = slam.init(of.capacity)
+    noise = jnp.arange(1.0, state.core.noise.size + 1)
+    core = replace(state.core, noise=noise)
+    still = identity(slam.motion.geometry, noise.dtype)
+    larger, _ = act(slam.model, still, jnp.asarray(2.0), core, state.landmarks)
+    n = slam.motion.geometry.point_dim
+    np.testing.assert_array_equal(larger.noise[:n], 2 * noise[:n])
+    np.testing.assert_array_equal(larger.noise[n:], noise[n:])
 
 
 def test_a_walk_is_of_a_common_error():

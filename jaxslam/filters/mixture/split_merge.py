@@ -63,8 +63,7 @@ def divided(slam: AbstractSlam, state: SumState, control: Control, seen: Feature
         # Of the logarithm: a turn is not to be split for what it does to the translation.
         return lambda core: cost @ log(slam.model.displacement(core, context))[: len(cost)]
 
-    parts = _parts(pixels_at, state)
-    return _split_and_merged(parts, max(1, state.log_weights.size // 3))
+    return _split_and_merged(_parts(pixels_at, state), max(1, state.log_weights.size // 3))
 
 
 def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:

@@ -34,7 +34,8 @@ def act(
     What drives the motion is enlarged with it: its variance is prior knowledge, no measurement.
     """
     in_base = not model.frame.moves_landmarks
-    variables, noise = model.motion.enlarged(core.motion, core.noise, factor)
+    driven = core.noise[: model.motion.noise_sigma.shape[-1]]
+    variables, noise = model.motion.enlarged(core.motion, driven, factor)
 
     def anchor(T_AF: SplitPose) -> SplitPose:
         enlarged = scaled(T_AF, factor)
@@ -50,8 +51,8 @@ def act(
         core,
         pose=model.frame.acted(core.pose, rigid, factor),
         motion=variables,
-        base_motion=None if kept is None else model.motion.enlarged(kept, core.noise, factor)[0],
-        noise=noise,
+        base_motion=None if kept is None else model.motion.enlarged(kept, driven, factor)[0],
+        noise=core.noise.at[: driven.size].set(noise),
         anchors=None if core.anchors is None else jax.vmap(anchor)(core.anchors),
     )
     return core, jax.vmap(landmark)(landmarks)

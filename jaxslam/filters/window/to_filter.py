@@ -152,7 +152,7 @@ def _core(slam: AbstractSlam, like, newest, log_scale):
     """The filter's core, with lengths in units of e^λ m."""
     frame, variables, common = newest
     unit = jnp.exp(-log_scale[0])
-    variables, _ = slam.motion.enlarged(variables, like.noise, unit)
+    variables, _ = slam.motion.enlarged(variables, jnp.asarray(slam.motion.noise_sigma), unit)
     kept = not slam.calibration.each_frame
     return replace(
         like,
