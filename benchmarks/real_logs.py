@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.evaluation import Convention, Evaluation, evaluate_log, evaluate_poses
 from jaxslam.evaluation.alignment import associated, similarity
 from jaxslam.evaluation.convention import from_right, pose_errors
-from jaxslam.evaluation.inputs import normalised
+from jaxslam.evaluation.inputs import squared, whitened
 from jaxslam.evaluation.pairing import read
 from jaxslam.io.logs.log import interpolated
 from jaxslam.statistics.bands import chi2_quantile
@@ -214,7 +214,7 @@ def as_smfeval(folder: Path, *, between: bool = False) -> dict[str, float]:
     they are in the alignment.
     """
     _, _, e, P = right_errors(folder, between=between)
-    nees = normalised(e[None, :, :3], P[None, :, :3, :3])[0]
+    nees = squared(whitened(e[None, :, :3], P[None, :, :3, :3]))[0]
     return {
         "n": len(nees),
         "anees": float(np.mean(nees)),
@@ -245,7 +245,7 @@ def fitted_by_weight(folder: Path, *, arm: bool) -> list[float]:
     )
     e = errors(best.x)
     parts = slice(0, 3), slice(3, 6)
-    return [float(np.mean(normalised(e[None, :, x], P[None, :, x, x]))) for x in parts]
+    return [float(np.mean(squared(whitened(e[None, :, x], P[None, :, x, x])))) for x in parts]
 
 
 def report_of_smfeval(folder: Path) -> dict[str, float]:

@@ -241,11 +241,6 @@ def correlations(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarr
     return covariances / sigma[..., :, None] / sigma[..., None, :]
 
 
-def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerStep:
-    """Return `eᵀ P⁻¹ e`. Raises ValueError as `whitened` does."""
-    return squared(whitened(errors, covariances))
-
-
 def squared(whitened: PerAxis) -> PerStep:
     """Return the sum of squares over the axes; infinite where it is not a number."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -326,9 +326,7 @@ def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> E
 def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None:
     """By how much the estimates are late and its σ, by the rotations of all runs; None where that
     is not beyond doubt, or the filter is not over-confident."""
-    if not suspect(found):
-        return None
-    late = _all_runs(read)
+    late = _all_runs(read) if suspect(found) else None
     return late if late is not None and Offset(*late).found else None
 
 

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
-from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, BY_SMALL, Aligned, aligned
+from jaxslam.evaluation.alignment import (
+    ALIGNMENTS,
+    BY_ANY,
+    BY_FIRST,
+    BY_SMALL,
+    Aligned,
+    aligned,
+)
 from jaxslam.evaluation.causes import causes
 from jaxslam.evaluation.convention import (
     Axes,
@@ -31,7 +38,6 @@ from jaxslam.evaluation.inputs import (
     Poses,
     checked_poses,
     filled,
-    normalised,
     sigmas,
     squared,
     step_times,
@@ -205,7 +211,7 @@ def _with_truth(
 ) -> Poses:
     """Add the σ of the truth, in the unit of the estimate where their ratio is free."""
     first, log_scale = np.argmax(world.poses.logged, axis=1), np.zeros(len(later.logged))
-    by_first = {BY_FIRST, BY_SMALL} & {*world.notes}
+    by_first = {BY_ANY, BY_FIRST, BY_SMALL} & {*world.notes}
     firsts = world.poses.truths[range(len(first)), first] if by_first else None
     if world.given:
         log_scale = np.nan_to_num(at_one_scale(later, convention, axes).scale.log_scale)
@@ -265,7 +271,7 @@ def _tried(
 
     def of(block: np.ndarray) -> np.ndarray:
         e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
-        return filled(normalised(e, P), found.logged, np.nan)
+        return filled(squared(whitened(e, P)), found.logged, np.nan)
 
     nees = filled(squared(found.whitened), found.logged, np.nan)
     log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())

@@ -123,7 +123,6 @@ def _of_yaml(text: str) -> dict[str, object]:
             fields.setdefault(".".join([*names, key]), value.strip("\"'"))
         else:
             above.append((indent, key))
-            continue
     return fields
 
 
