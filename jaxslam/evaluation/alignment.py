@@ -296,7 +296,7 @@ def aligned(
     first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
     known = exactly_known(first[:, axes][:, :, axes]).all()
     if align == "first" and not known:
-        moved = _each_run(poses, convention, _by_any_first)._replace(joint=None)
+        moved = _each_run(poses._replace(joint=None), convention, _by_any_first)
         return Aligned(moved, given, (BY_ANY,))
     if known or (not given and align != "sim3" and _small_at_first(poses, convention, align)):
         by_first = _each_run(poses, convention, partial(_by_first, yaw=align == "yaw"))

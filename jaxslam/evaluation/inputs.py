@@ -115,9 +115,11 @@ def padded(
 ) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...], Int[np.ndarray, "runs steps"]]:
     """Innovations and their covariances without the NaN of what was not measured, and the numbers
     of those that were: of one that is NaN the innovation is 0, of variance 1, and independent."""
-    e, P = np.array(errors, np.float64), np.array(covariances, np.float64)
-    if e.ndim != 3 or P.shape != (*e.shape, e.shape[-1]):
+    e, P = np.array(errors), np.array(covariances)
+    shapes = e.ndim == 3 and P.shape == (*e.shape, e.shape[-1])
+    if not shapes or any(x.dtype.kind not in "fiu" for x in (e, P)):
         return e, P, np.zeros(e.shape[:2], int)
+    e, P = e.astype(np.float64), P.astype(np.float64)
     there = ~(np.isnan(e) & np.isnan(np.diagonal(P, axis1=-2, axis2=-1)))
     some = there.any(axis=-1, keepdims=True)
     without = ~there & some

@@ -101,9 +101,7 @@ def evaluate_log(
         told = (advice(found),) if found.quantity == "NIS" and found.names else ()
         return described(found, run_names=runs, notes=(*found.notes, *told))
     if nis:
-        raise ValueError(
-            f"{source}: innovations must be in an npz or CSV file, not in a trajectory"
-        )
+        raise ValueError(f"{source}: innovations must be in an npz or CSV file")
     runs = runs_of(source, covariance, truth, estimate)
     return evaluate_runs(source, runs, stated, how, time_offset, against=against is not None)
 
@@ -112,10 +110,9 @@ def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
     """Whether a file is a table of errors: one without a truth beside it, or with such titles."""
     if ros.is_bag(source) or any(value is not None for value in beside.values()):
         return False
-    if source.suffix == ".csv":
-        return True
-    table = read_table(source, "log", "errors", "numbers")
-    return bool(table.titles) and table.titles[0].lower() in ("run", *STEP_FIRST[:2])
+    table = source.suffix == ".csv"
+    titles = () if table else read_table(source, "log", "errors", "numbers").titles
+    return table or (bool(titles) and titles[0].lower() in ("run", *STEP_FIRST[:2]))
 
 
 def _evaluate_arrays(

@@ -369,7 +369,8 @@ def _sigmas(log: Log, P: Float[np.ndarray, "n t t"], convention: Convention) -> 
     there = ~np.isnan(P).any(axis=(1, 2)) & np.any(P, axis=(1, 2))
     if not there.any():
         return np.full(2, np.nan)
-    split = converted(P[there], log.poses[there], convention, _SAME)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused later
+        split = np.nan_to_num(converted(P[there], log.poses[there], convention, _SAME))
     n = log.poses.shape[-1] - 1
     variance = np.maximum(np.diagonal(split, axis1=1, axis2=2), 0.0)
     least = [np.sqrt(np.median(x.min(axis=1))) for x in (variance[:, :n], variance[:, n:])]

@@ -601,7 +601,7 @@ def evaluate_nees(
     """
     values = numbers(quantity, nees, 2, "(runs, steps), with one run nees[None]")
     try:
-        each = np.broadcast_to(np.asarray(dof, np.float64), values.shape)
+        each = np.broadcast_to(np.array(dof).astype(np.float64, casting="same_kind"), values.shape)
     except (ValueError, TypeError):
         each = np.zeros(values.shape)
     told = each[~np.isnan(values)]
@@ -656,10 +656,10 @@ def neighbours_correlate(nis: Evaluation) -> float | None:
     `ρ = Σ zₜ·zₜ₊₁ / Σ zₜ²`. The innovations of an optimal gain are white; with a gain too small the
     estimate lags, and neighbours have one sign; with one too large it overshoots (Mehra 1970).
     """
-    z = np.nan_to_num(nis.errors / nis.sigmas)
+    z = np.clip(np.nan_to_num(nis.errors / nis.sigmas), -1e140, 1e140)
     squared = float(np.sum(z**2))
     pairs = np.count_nonzero(nis.logged[:, 1:] & nis.logged[:, :-1]) * z.shape[-1]
-    if not np.isfinite(squared) or squared == 0 or not pairs:
+    if squared == 0 or not pairs:
         return None
     rho = float(np.sum(z[:, 1:] * z[:, :-1]) / squared)
     # Beyond three σ of white innovations is one in 370 of a right filter; and a correlation below

@@ -101,8 +101,10 @@ def _of_cameras(count: np.ndarray, each: int, more: tuple[int, ...]) -> tuple[in
 def _w_first(table: Table) -> Log | None:
     """Lines `t p q …` with w first, of EuRoC (17 numbers) and of VINS-Mono (11)."""
     count = table.rows.shape[1]
+    if count not in (8, 11, 17) or np.abs(table.rows[:, 4:8]).max() > 2:
+        return None
     unit = np.abs(np.linalg.norm(table.rows[:, 4:8], axis=1) - 1) < _LENGTH
-    if count not in (8, 11, 17) or not unit.all() or (count == 8 and table.rows[0, 0] < 1e17):
+    if not unit.all() or (count == 8 and table.rows[0, 0] < 1e17):
         return None
     found = log(table, table.rows[:, 0], table.rows[:, 1:4], table.rows[:, [5, 6, 7, 4]])
     note = f"{table.path}: {count} columns are taken as t p q …, with w first (EuRoC, VINS-Mono)"
