@@ -93,6 +93,14 @@ def yaw_alone(M: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return R
 
 
+def nearest_rotation(M: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The rotation that makes `tr Rᵀ M` the greatest (Kabsch 1976)."""
+    left, _, right = np.linalg.svd(M)
+    signs = np.ones(len(M))
+    signs[-1] = np.sign(np.linalg.det(left @ right))
+    return left * signs @ right
+
+
 def similarity(
     estimate: Float[np.ndarray, "k n"],
     reference: Float[np.ndarray, "k n"],

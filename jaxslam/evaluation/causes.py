@@ -13,7 +13,7 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
 
-from jaxslam.evaluation.alignment import aligned, gauge_directions, similarity
+from jaxslam.evaluation.alignment import aligned, gauge_directions, nearest_rotation, similarity
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
@@ -85,10 +85,7 @@ def _angles(R: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k"]:
 
 def _mean_rotation(R: Float[np.ndarray, "k n n"]) -> Float[np.ndarray, "n n"]:
     """The rotation nearest to their mean."""
-    left, _, right = np.linalg.svd(R.mean(axis=0))
-    signs = np.ones(len(left))
-    signs[-1] = np.sign(np.linalg.det(left @ right))
-    return left * signs @ right
+    return nearest_rotation(R.mean(axis=0))
 
 
 def _rms(values: np.ndarray) -> float:
@@ -291,10 +288,10 @@ def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
         ).as_rotvec()
         for T in (poses.estimates, poses.truths)
     )
-    left, singular, right = np.linalg.svd(own.T @ true)
+    singular = np.linalg.svd(own.T @ true, compute_uv=False)
     if singular[1] < UNDETERMINED * singular[0]:
         return np.eye(3)
-    return left * [1.0, 1.0, np.sign(np.linalg.det(left @ right))] @ right
+    return nearest_rotation(own.T @ true)
 
 
 def _by_part(compared: Compared, poses: Poses, align: str, found: Evaluation) -> str:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.evaluation.alignment import nearest_rotation
 from jaxslam.io.logs.log import interpolated
 
 FURTHEST = 0.5
@@ -60,9 +61,7 @@ def clock_offset(
         if there.sum() < _LEAST:
             return np.full_like(own, np.nan)
         if own.shape[1] == 3:
-            left, _, right = np.linalg.svd(own[there].T @ theirs[there])
-            left[:, -1] *= np.sign(np.linalg.det(left @ right))
-            theirs = theirs @ (left @ right).T
+            theirs = theirs @ nearest_rotation(own[there].T @ theirs[there]).T
         return own - theirs
 
     def cost(late: float) -> float:
