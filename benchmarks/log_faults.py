@@ -133,11 +133,9 @@ def another_world(rng: np.random.Generator, log: Flight, upright: bool = False) 
     if upright:
         R = Rotation.from_euler("z", rng.uniform(-3, 3)).as_matrix()
     S = Similarity(R, rng.uniform(-20, 20, 3), 1.0)
-    P = []
-    for T, own in zip(log.estimates, log.covariances, strict=True):
-        J = S.derivative(T, log.convention)
-        P.append(J @ own @ np.swapaxes(J, 1, 2))
-    return log._replace(estimates=S.moved(log.estimates), covariances=np.array(P))
+    T, split = S.moved(log.estimates), Convention("split")
+    P = S.block @ converted(log.covariances, log.estimates, log.convention, split) @ S.block.T
+    return log._replace(estimates=T, covariances=converted(P, T, split, log.convention))
 
 
 def late(rng: np.random.Generator, log: Flight) -> Flight:

@@ -9,7 +9,7 @@ onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -56,16 +56,15 @@ class Similarity(NamedTuple):
         result[..., :n, n] = self.scale * T_wc[..., :n, n] @ self.rotation.T + self.translation
         return result
 
-    def derivative(
-        self, T_wc: Float[np.ndarray, "k d d"], convention: Convention
-    ) -> Float[np.ndarray, "k t t"]:
-        """Return J of `ξ there = J ξ here`, errors of the poses in the convention."""
-        here, n = change(T_wc, convention, _SPLIT), len(self.translation)
-        J = np.eye(here.shape[-1])
-        J[:n, :n] = self.scale * self.rotation
+    @property
+    def block(self) -> Float[np.ndarray, "t t"]:
+        """The derivative of an error of a pose, split along the axes of the world."""
+        n = len(self.translation)
+        B = np.eye(6 if n == 3 else 3)
+        B[:n, :n] = self.scale * self.rotation
         if n == 3:
-            J[n:, n:] = self.rotation
-        return change(self.moved(T_wc), _SPLIT, convention) @ J @ here
+            B[n:, n:] = self.rotation
+        return B
 
 
 def associated(
@@ -181,53 +180,48 @@ def at_first_pose(
 def projected(
     T_wc: Float[np.ndarray, "k d d"],
     covariances: Float[np.ndarray, "k t t"] | Float[np.ndarray, "kt kt"],
-    convention: Convention,
     align: str,
     line: Float[np.ndarray, " 3"] | None = None,
 ) -> Float[np.ndarray, "k t t"]:
     """The covariances of aligned poses in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
 
     About a `line` it is that of `turned_about`. `covariances` are those of every pose, whose errors
-    are then taken as independent of each other's, or the joint one of all. With W = (VᵀU)⁻¹ the
-    k-th block of `Q P Qᵀ` is `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
+    are then taken as independent of each other's, or the joint one of all; of errors that are split
+    along the axes of the world. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
+    `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
     if covariances.ndim == 3:
-        return _projected_by_blocks(T_wc, covariances, convention, align, line)
+        return _projected_by_blocks(T_wc, covariances, align, line)
     U = gauge_directions(T_wc, align)
     V = _fitted(U, line)
     count, t = U.shape[:2]
     P = np.swapaxes(covariances.reshape(count, t, count, t), 1, 2)
-    J = change(T_wc, convention, _SPLIT)
-    P = J[:, None] @ P @ np.swapaxes(J, 1, 2)
     VP = np.einsum("kta,kjtu->jau", V, P)
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
-    result = _projected(P[range(count), range(count)], UW, VP, np.sum(VP @ V, axis=0))
-    return converted(result, T_wc, _SPLIT, convention)
+    return _projected(P[range(count), range(count)], UW, VP, np.sum(VP @ V, axis=0))
 
 
 def _projected_by_blocks(
     T_wc: Float[np.ndarray, "k d d"],
-    covariances: Float[np.ndarray, "k t t"],
-    convention: Convention,
+    P: Float[np.ndarray, "k t t"],
     align: str,
     line: Float[np.ndarray, " 3"] | None,
 ) -> Float[np.ndarray, "k t t"]:
     """The same of errors that are independent: its sums over all poses first, then every pose."""
 
-    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         U = gauge_directions(T_wc[part], align)
         V = _fitted(U, line)
-        P = converted(covariances[part], T_wc[part], convention, _SPLIT)
-        return U, V, P, np.swapaxes(V, 1, 2) @ P
+        return U, V, np.swapaxes(V, 1, 2) @ P[part]
 
     VU, VPV = np.zeros(()), np.zeros(())
     for part in blocks(len(T_wc)):
-        U, V, _, VP = of(part)
+        U, V, VP = of(part)
         VU, VPV = VU + np.einsum("kta,ktb->ab", V, U), VPV + np.sum(VP @ V, axis=0)
-    W, result = np.linalg.pinv(VU), np.empty_like(covariances)
+    W, result = np.linalg.pinv(VU), np.empty_like(P)
     for part in blocks(len(T_wc)):
-        U, _, P, VP = of(part)
-        result[part] = converted(_projected(P, U @ W, VP, VPV), T_wc[part], _SPLIT, convention)
+        U, _, VP = of(part)
+        result[part] = _projected(P[part], U @ W, VP, VPV)
     return result
 
 
@@ -287,6 +281,8 @@ class Aligned(NamedTuple):
     given: bool
     """Whether their scale is still free, so that NEES is given the scale."""
     notes: tuple[str, ...] = ()
+    log_scale: Float[np.ndarray, " runs"] = np.zeros(0)
+    """The log of the estimate's unit relative to the truth's, of what was done to every run."""
 
 
 def aligned(
@@ -295,64 +291,72 @@ def aligned(
     """The estimates aligned by `none`, `first`, `yaw` (and position), `se3` or `sim3`.
 
     Where the first pose is known, with no variance on these `axes` of the covariances, or a small
-    one, it is by the first pose, and with `first` in any case; else to all positions. Raises
-    ValueError for what does not go together.
+    one, it is by the first pose, and with `first` in any case; else to all positions. The first
+    position then is the origin, also of scaling. Raises ValueError for what does not go together.
     """
     given = convention.scale == "given"
     if align == "none":
         return Aligned(poses, given)
-    first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
-    known = exactly_known(first[:, axes][:, :, axes]).all()
-    if align == "first" and not known:
-        moved = _each_run(poses._replace(joint=None), convention, _by_any_first)
-        return Aligned(moved, given, (BY_ANY,))
-    if known or (not given and align != "sim3" and _small_at_first(poses, convention, align)):
-        by_first = _each_run(poses, convention, partial(_by_first, yaw=align == "yaw"))
-        return Aligned(by_first, given or align == "sim3", (BY_FIRST if known else BY_SMALL,))
-    if given and align != "sim3":
+    runs = range(len(poses.logged))
+    places = runs, np.argmax(poses.logged, axis=1)
+    known = exactly_known(poses.covariances[places][:, axes][:, :, axes]).all()
+    here = carried(poses, convention, _SPLIT)
+    any_first = align == "first" and not known
+    small = not given and align != "sim3" and _small_at_first(here, align)
+    if known or any_first or small:
+        truths = here.truths.copy()
+        truths[..., :-1, -1] -= here.truths[places][:, None, :-1, -1]
+        joint = None if any_first else here.joint
+        here = here._replace(truths=np.where(here.logged[..., None, None], truths, here.truths))
+        lay = _by_any_first if any_first else partial(_by_first, yaw=align == "yaw")
+        notes = (BY_ANY if any_first else BY_FIRST if known else BY_SMALL,)
+        given |= align == "sim3"
+    elif given and align != "sim3":
         raise ValueError(
             "covariances given the scale need --align sim3, or se3 if the first covariance is zero"
         )
-    to_all = partial(_to_all, align=align)
-    notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
-    if align != "yaw" and any(_line(run, convention) is not None for run in _runs(poses)):
-        notes += (STRAIGHT,)
-    return Aligned(_each_run(poses, convention, to_all)._replace(joint=None), False, notes)
+    else:
+        lay, joint = partial(_to_all, align=align), None
+        notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
+        if align != "yaw" and any(_line(run) is not None for run in _runs(here)):
+            notes += (STRAIGHT,)
+    T, log_scale = here.estimates.copy(), np.zeros(len(runs))
+    for i, run in enumerate(_runs(here)):
+        motion, P = lay(run)
+        B, there = motion.block, here.logged[i]
+        T[i, there], here.covariances[i, there] = motion.moved(run.estimates), B @ P @ B.T
+        log_scale[i] = -np.log(motion.scale)
+        if joint is not None:
+            blocks_of = joint[i].reshape(len(there), len(B), len(there), len(B))
+            joint[i] = np.einsum("ab,kblc,dc->kald", B, blocks_of, B, optimize=True).reshape(
+                joint[i].shape
+            )
+    moved = here._replace(estimates=T, joint=joint)
+    return Aligned(carried(moved, _SPLIT, convention), given, notes, log_scale)
+
+
+def carried(poses: Poses, old: Convention, new: Convention) -> Poses:
+    """The same poses, with covariances of errors of another convention."""
+    P = converted(poses.covariances, poses.estimates, old, new)
+    if poses.joint is None:
+        return poses._replace(covariances=P)
+    J = change(poses.estimates, old, new)
+    of_blocks = poses.joint.reshape(*J.shape[:3], *J.shape[1:3])
+    joint = np.einsum("rkab,rkblc,rldc->rkald", J, of_blocks, J, optimize=True)
+    return poses._replace(covariances=P, joint=joint.reshape(poses.joint.shape))
 
 
 def _runs(poses: Poses) -> Iterator[Poses]:
     """Yield every run by itself, of the poses that were logged."""
     for run, logged in enumerate(poses.logged):
-        joint = None
-        if poses.joint is None and logged.all():
-            yield Poses(*(x[run] for x in poses[:4]))
-            continue
+        own, joint = (slice(None) if logged.all() else logged), None
         if poses.joint is not None:
             rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
             joint = poses.joint[run][np.ix_(rows, rows)]
-        yield Poses(*(x[run, logged] for x in poses[:4]), joint)
+        yield Poses(*(x[run, own] for x in poses[:4]), joint)
 
 
-def _each_run(
-    poses: Poses, convention: Convention, lay: Callable[[Poses, Convention], Poses]
-) -> Poses:
-    if len(poses.logged) == 1 and poses.logged.all():
-        moved = lay(next(_runs(poses)), convention)
-        joint = None if moved.joint is None else moved.joint[None]
-        return Poses(*(x[None] for x in moved[:3]), poses.logged, joint)
-    result = [x.copy() for x in poses[:3]]
-    joint = None if poses.joint is None else poses.joint.copy()
-    for number, run in enumerate(_runs(poses)):
-        moved, logged = lay(run, convention), poses.logged[number]
-        for x, there in zip(result, moved[:3], strict=True):
-            x[number, logged] = there
-        if joint is not None and moved.joint is not None:
-            rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
-            joint[number][np.ix_(rows, rows)] = moved.joint
-    return Poses(*result, poses.logged, joint)
-
-
-def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
+def _small_at_first(poses: Poses, align: str) -> bool:
     """Whether what the error of a run's first pose moves the others by is small beside their σ.
 
     The farther a pose is, the more it is moved by the rotation of the first.
@@ -362,8 +366,7 @@ def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
     upright = align == "yaw" and n == 3
     fixed = np.array([0, 1, 2, 5]) if upright else np.arange(poses.covariances.shape[-1])
     for run in _runs(poses):
-        P = converted(run.covariances, run.estimates, convention, _SPLIT)
-        U = gauge_directions(run.estimates, align)
+        P, U = run.covariances, gauge_directions(run.estimates, align)
         J = U @ np.linalg.inv(U[0, fixed])
         moved = J @ P[0][np.ix_(fixed, fixed)] @ np.swapaxes(J, 1, 2)
         for part in (slice(0, n), slice(5, 6) if upright else slice(n, None)):
@@ -375,59 +378,32 @@ def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
     return True
 
 
-def _by_any_first(run: Poses, convention: Convention) -> Poses:
+def _by_any_first(run: Poses) -> tuple[Similarity, np.ndarray]:
     """Align the first pose, whose error then moves all others, `e_k − U_k U₀⁻¹ e₀`: its covariance
     is added to theirs as if both were independent."""
-    P = converted(run.covariances, run.estimates, convention, _SPLIT)
-    U = gauge_directions(run.estimates, "se3")
+    P, U = run.covariances.copy(), gauge_directions(run.estimates, "se3")
     J = U[1:] @ np.linalg.inv(U[0])
     P[1:] += J @ P[0] @ np.swapaxes(J, 1, 2)
-    P = converted(P, run.estimates, _SPLIT, convention)
-    return _by_first(run._replace(covariances=P, joint=None), convention, yaw=False)
+    return at_first_pose(run.estimates[0], run.truths[0]), P
 
 
-def _by_first(run: Poses, convention: Convention, *, yaw: bool) -> Poses:
-    """Align the first pose to its truth; its position becomes the origin, also of scaling."""
-    moved = _moved(run, convention, at_first_pose(run.estimates[0], run.truths[0], yaw=yaw))
-    return about(moved, convention, run.truths[0, :-1, -1])
+def _by_first(run: Poses, *, yaw: bool) -> tuple[Similarity, np.ndarray]:
+    return at_first_pose(run.estimates[0], run.truths[0], yaw=yaw), run.covariances
 
 
-def about(run: Poses, convention: Convention, centre: Float[np.ndarray, " n"]) -> Poses:
-    """Return estimates and truths of a run in the world whose origin is that point."""
-    away = Similarity(np.eye(len(centre)), -centre, 1.0)
-    return _moved(run, convention, away)._replace(truths=away.moved(run.truths))
-
-
-def _to_all(run: Poses, convention: Convention, *, align: str) -> Poses:
+def _to_all(run: Poses, *, align: str) -> tuple[Similarity, np.ndarray]:
     n, yaw = run.truths.shape[-1] - 1, align == "yaw"
     positions = run.estimates[:, :n, n], run.truths[:, :n, n]
     fit = similarity(*positions, scaled=align == "sim3", yaw=yaw)
-    line = None if yaw else _line(run, convention)
+    line = None if yaw else _line(run)
     if line is not None:
         fit = turned_about(fit, line, run.estimates, run.truths)
     P = run.covariances if run.joint is None else run.joint
-    P = projected(run.estimates, P, convention, align, line)
-    return _moved(run._replace(covariances=P, joint=None), convention, fit)
+    return fit, projected(run.estimates, P, align, line)
 
 
-def _line(run: Poses, convention: Convention) -> Float[np.ndarray, " n"] | None:
+def _line(run: Poses) -> Float[np.ndarray, " n"] | None:
     """The direction of an estimate on a straight line, by the largest σ of every position."""
     n, every = run.estimates.shape[-1] - 1, -(-len(run.estimates) // MOST)
-    T = run.estimates[::every]
-    split = converted(run.covariances[::every], T, convention, _SPLIT)
-    variance = np.linalg.eigvalsh(split[:, :n, :n])[:, -1]
-    return straight_line(T[:, :n, n], np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
-    """Return estimates and covariances in another world."""
-    P, joint = np.empty_like(run.covariances), run.joint
-    for part in blocks(len(P)):
-        J = motion.derivative(run.estimates[part], convention)
-        P[part] = J @ run.covariances[part] @ np.swapaxes(J, 1, 2)
-    if joint is not None:
-        J = motion.derivative(run.estimates, convention)
-        count, t = J.shape[:2]
-        half = np.einsum("kab,kblc->kalc", J, joint.reshape(count, t, count, t), optimize=True)
-        joint = np.einsum("kalc,ldc->kald", half, J, optimize=True).reshape(joint.shape)
-    return run._replace(estimates=motion.moved(run.estimates), covariances=P, joint=joint)
+    variance = np.linalg.eigvalsh(run.covariances[::every, :n, :n])[:, -1]
+    return straight_line(run.estimates[::every, :n, n], np.sqrt(np.maximum(variance, 0.0)))

@@ -8,12 +8,14 @@ on strong evidence, with a number and the NEES without it; then there is no verd
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import aligned, gauge_directions, nearest_rotation, similarity
+from jaxslam.evaluation.clock import increments
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
@@ -32,11 +34,31 @@ LESS = 3.0
 """The factor by which a constant that is fitted lessens the errors that it explains."""
 TURNED = np.radians(60)
 """A rotation between worlds that is no error of a filter's first heading."""
+UNEXPLAINED = 5.0
+"""Errors that a constant leaves, in σ of the worst axis, beyond which the filter is wrong."""
 MANY = 10
 """Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
 FEWEST, ALPHA = 4, 1e-3
 """The fewest runs that a constant can be common to, and the chance that one is found of none."""
+
+
+class _Case(NamedTuple):
+    """Poses whose errors are larger than σ says, and how they were compared."""
+
+    poses: Poses
+    convention: Convention
+    align: str
+    found: Evaluation
+    compared: Compared
+
+    def again(self, poses: Poses, axes: Sequence[str] = ()) -> Evaluation:
+        """The evaluation of other poses in the same way."""
+        return self.compared(poses, self.align, axes)
+
+    def instead(self, fixed: Evaluation) -> str:
+        """The NEES without a cause, and with it."""
+        return f"NEES is {_nees(fixed):.4g} instead of {_nees(self.found):.4g}"
 
 
 def causes(
@@ -49,15 +71,14 @@ def causes(
     few = poses.some()
     if few is not poses:
         poses, found = few, compared(few, align, ())
-    spatial = poses.estimates.shape[-1] == 4
-    turns = spatial and any(name.startswith("r") for name in found.names)
-    for look in ((_w_first,) if turns else ()) + (_worlds, _tilt, _mounting):
-        mistake = look(poses, convention, align, found, compared)
+    case = _Case(poses, convention, align, found, compared)
+    turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
+    looks = (*((_w_first,) if turns else ()), _worlds, _tilt, _mounting)
+    for look in (*looks, *((_half_angles,) if turns else ())):
+        mistake = look(case)
         if mistake is not None:
             yield mistake
             return
-    if turns and (mistake := _half_angles(poses, convention, align, found, compared)):
-        yield mistake
 
 
 def suspect(found: Evaluation) -> bool:
@@ -71,10 +92,6 @@ def _right(found: Evaluation) -> bool:
 
 def _nees(found: Evaluation) -> float:
     return float(np.mean(found.nees[found.logged]))
-
-
-def _instead(found: Evaluation, fixed: Evaluation) -> str:
-    return f"NEES is {_nees(fixed):.4g} instead of {_nees(found):.4g}"
 
 
 def _angles(R: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k"]:
@@ -115,16 +132,13 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
                 return
 
 
-def _w_first(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Mistake | None:
-    there = poses.logged
+def _w_first(case: _Case) -> Mistake | None:
+    poses, there = case.poses, case.poses.logged
 
     def off(T: Matrices, true: Matrices) -> float:
         turn = np.swapaxes(T[there][:, :3, :3], 1, 2) @ true[there][:, :3, :3]
         # Up to a constant, as of another world or body.
-        constant = _mean_rotation(turn)
-        return float(np.median(_angles(turn @ constant.T)))
+        return float(np.median(_angles(turn @ _mean_rotation(turn).T)))
 
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
@@ -132,11 +146,11 @@ def _w_first(
     for name, which in (("estimate", "estimates"), ("truth", "truths")):
         changed = poses._replace(**{which: _reread(getattr(poses, which), there)})
         if off(changed.estimates, changed.truths) < before / 4:
-            fixed = compared(changed, align, ())
+            fixed = case.again(changed)
             return Mistake(
                 f"quaternions of the {name} have w first",
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
-                f"the {name} read as qw qx qy qz {_instead(found, fixed)}; write qx qy qz qw, or "
+                f"the {name} read as qw qx qy qz {case.instead(fixed)}; write qx qy qz qw, or "
                 "name the columns",
                 _nees(fixed),
             )
@@ -151,111 +165,106 @@ def _reread(T: Matrices, there: np.ndarray) -> Matrices:
     return result
 
 
-def _worlds(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Mistake | None:
+def _worlds(case: _Case) -> Mistake | None:
     """Positions that agree after an alignment, by a large rotation or of first poses apart."""
-    if align != "none":
+    if case.align != "none":
         return None
+    poses, found = case.poses, case.found
     n = poses.estimates.shape[-1] - 1
-    before, after, scaled, first, angles, tilts = [], [], [], [], [], []
-    for run, there in enumerate(poses.logged):
-        p, true = poses.estimates[run, there, :n, n], poses.truths[run, there, :n, n]
-        try:
-            fit, scale = (similarity(p, true, scaled=x) for x in (False, True))
-        except ValueError:
-            return None
-        before.append(_rms(p - true))
-        after.append(_rms(p @ fit.rotation.T + fit.translation - true))
-        scaled.append(_rms(scale.scale * p @ scale.rotation.T + scale.translation - true))
-        first.append(np.linalg.norm(p[0] - true[0]))
-        angles.append(float(_angles(fit.rotation)))
-        tilts.append(float(np.arccos(np.clip(fit.rotation[-1, -1], -1, 1))) if n == 3 else 0.0)
-    rms, left = float(np.median(before)), float(np.median(after))
-    sigma = float(np.nanmedian(np.where(np.isfinite(found.sigmas), found.sigmas, np.nan)))
-    apart = np.median(first) > max(0.2 * rms, 5 * sigma) or np.median(angles) > TURNED
-    if not (rms > 5 * max(left, 1e-12) and apart):
+    try:
+        rows = [
+            _apart(*(x[run, there, :n, n] for x in (poses.estimates, poses.truths)))
+            for run, there in enumerate(poses.logged)
+        ]
+    except ValueError:
         return None
-    by = "yaw" if n == 3 and np.median(tilts) < np.radians(2) else "se3"
-    if np.median(scaled) < left / LESS:
-        by = "sim3"
-    fixed = compared(poses, by, ())
+    rms, left, scaled, first, angle, tilt = np.median(rows, axis=0)
+    sigma = float(np.nanmedian(np.where(np.isfinite(found.sigmas), found.sigmas, np.nan)))
+    if rms <= 5 * max(left, 1e-12) or (first <= max(0.2 * rms, 5 * sigma) and angle <= TURNED):
+        return None
+    by = "yaw" if n == 3 and tilt < np.radians(2) else "se3"
+    by = "sim3" if scaled < left / LESS else by
+    fixed = case.compared(poses, by, ())
     return Mistake(
         "estimate and truth are not in one world",
         f"positions differ by {rms:.3g} m (RMS) and by {left:.3g} m once aligned, by "
-        f"{np.degrees(np.median(angles)):.3g}°: with --align {by} {_instead(found, fixed)}",
+        f"{np.degrees(angle):.3g}°: with --align {by} {case.instead(fixed)}",
         _nees(fixed),
     )
 
 
-def _tilt(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Mistake | None:
+def _apart(p: Float[np.ndarray, "k n"], true: Float[np.ndarray, "k n"]) -> list[float]:
+    """How far positions of a run are from true ones (RMS): as they are, aligned, and scaled too;
+    the first of them; and the angle of the alignment, and that of its vertical."""
+    fits = [similarity(p, true, scaled=scaled) for scaled in (False, True)]
+    moved = (x.scale * p @ x.rotation.T + x.translation for x in fits)
+    R, first = fits[0].rotation, float(np.linalg.norm(p[0] - true[0]))
+    tilt = float(np.arccos(np.clip(R[-1, -1], -1, 1)))
+    return [*(_rms(x - true) for x in (p, *moved)), first, float(_angles(R)), tilt]
+
+
+def _tilt(case: _Case) -> Mistake | None:
     """An alignment of roll and pitch, which the filter observes; or of yaw alone, in two worlds."""
-    if poses.estimates.shape[-1] != 4 or align not in ("se3", "yaw"):
+    if case.poses.estimates.shape[-1] != 4 or case.align not in ("se3", "yaw"):
         return None
-    other = "yaw" if align == "se3" else "se3"
-    fixed = compared(poses, other, ())
-    if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
+    other = "yaw" if case.align == "se3" else "se3"
+    fixed = case.compared(case.poses, other, ())
+    if not _right(fixed) or _nees(fixed) > _nees(case.found) / 1.2:
         return None
     why = (
         "the filter knows roll and pitch, which se3 aligns too"
         if other == "yaw"
         else "the verticals of both worlds differ"
     )
-    told = f"{why}: with --align {other} {_instead(found, fixed)}"
-    return Mistake(f"an alignment by {align}", told, _nees(fixed))
+    told = f"{why}: with --align {other} {case.instead(fixed)}"
+    return Mistake(f"an alignment by {case.align}", told, _nees(fixed))
 
 
-def _mounting(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Mistake | None:
+def _mounting(case: _Case) -> Mistake | None:
     """A constant X between the bodies, `T = W T̂ X`: its rotation, and its lever arm."""
-    best, X = found, np.eye(poses.estimates.shape[-1])
+    best, X = case.found, np.eye(case.poses.estimates.shape[-1])
     for lever, gain in ((False, 1.5), (True, 1.2)):
-        other = _fitted(poses, convention, align, X, lever=lever)
-        fixed = compared(_unmounted(poses, other), align, ())
+        other = _fitted(case, X, lever=lever)
+        fixed = case.again(_unmounted(case.poses, other))
         if _nees(fixed) < _nees(best) / gain:
             best, X = fixed, other
-    n = len(X) - 1
-    angle, metres = float(_angles(X[:n, :n])), float(np.linalg.norm(X[:n, n]))
-    moved = _unmounted(poses, X)
-    if best is found:
+    if best is case.found:
         return None
-    if not _of_body(poses, found, best, angle) and not (
-        _right(best)
-        and _in_all_runs(X, aligned(moved, convention, align, np.arange(len(found.names))).poses)
-    ):
+    n, moved = len(X) - 1, _unmounted(case.poses, X)
+    angle, metres = float(_angles(X[:n, :n])), float(np.linalg.norm(X[:n, n]))
+    if not _of_body(case, best, angle) and not (_right(best) and _in_all_runs(X, case, moved)):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
     parts += [f"a lever arm of {metres:.3g} m"] if metres > 0 else []
     return Mistake(
         "estimate and truth are of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
-        f"{_instead(found, best)}{_by_part(compared, moved, align, found)}; give the truth of the "
-        "body that is estimated",
+        f"{case.instead(best)}{_by_part(case, moved)}; give the truth of the body that is "
+        "estimated",
         _nees(best),
     )
 
 
-def _fitted(
-    poses: Poses, convention: Convention, align: str, X: Float[np.ndarray, "d d"], *, lever: bool
-) -> Float[np.ndarray, "d d"]:
+def _fitted(case: _Case, X: Float[np.ndarray, "d d"], *, lever: bool) -> Float[np.ndarray, "d d"]:
     """X by least squares, of alignments and fits in turn; its rotation from that of increments."""
-    n, there = len(X) - 1, poses.logged
-    axes = np.arange(geometry_of(poses.estimates).tangent_dim)
+    n, there = len(X) - 1, case.poses.logged
     X = X.copy()
     if not lever and n == 3:
-        X[:n, :n] = _by_increments(poses)
+        X[:n, :n] = _by_increments(case.poses)
     for _ in range(ROUNDS):
-        world = aligned(_unmounted(poses, X), convention, align, axes).poses
+        world = _in_world(case, _unmounted(case.poses, X))
         between = np.linalg.inv(world.estimates[there]) @ world.truths[there]
         step = np.eye(n + 1)
         step[:n, :n] = _mean_rotation(between[:, :n, :n])
         if lever:
-            step[:n, n] = _lever_arm(world, align)
+            step[:n, n] = _lever_arm(world, case.align)
         X = step @ X
     return X
+
+
+def _in_world(case: _Case, poses: Poses) -> Poses:
+    axes = np.arange(geometry_of(poses.estimates).tangent_dim)
+    return aligned(poses, case.convention, case.align, axes).poses
 
 
 def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
@@ -279,43 +288,39 @@ def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
 
 def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
     """C of `φ̂ = C φ`, rotation vectors from pose to pose; 1 where they do not determine it."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    both = poses.logged[:, 1:] & poses.logged[:, :-1]
     own, true = (
-        Rotation.from_matrix(
-            (np.swapaxes(T[:, :-1, :3, :3], 2, 3) @ T[:, 1:, :3, :3])[both]
-        ).as_rotvec()
+        np.concatenate([increments(run) for run in np.where(there, T, np.nan)])
+        for there in [poses.logged[..., None, None]]
         for T in (poses.estimates, poses.truths)
     )
-    singular = np.linalg.svd(own.T @ true, compute_uv=False)
-    if singular[1] < UNDETERMINED * singular[0]:
-        return np.eye(3)
-    return nearest_rotation(own.T @ true)
+    both = ~np.isnan(own).any(axis=1)
+    M = own[both].T @ true[both]
+    singular = np.linalg.svd(M, compute_uv=False)
+    return np.eye(3) if singular[1] < UNDETERMINED * singular[0] else nearest_rotation(M)
 
 
-def _by_part(compared: Compared, poses: Poses, align: str, found: Evaluation) -> str:
+def _by_part(case: _Case, poses: Poses) -> str:
     """The NEES of position and of rotation by themselves."""
-    turns = [name for name in found.names if name.startswith("r")]
-    parts = {"position": [x for x in found.names if x not in turns], "rotation": turns}
+    turns = [name for name in case.found.names if name.startswith("r")]
+    parts = {"position": [x for x in case.found.names if x not in turns], "rotation": turns}
     told = [
-        f"{what} {_nees(compared(poses, align, axes)):.3g} of {len(axes)}"
+        f"{what} {_nees(case.again(poses, axes)):.3g} of {len(axes)}"
         for what, axes in parts.items()
         if axes
     ]
     return f" ({', '.join(told)})" if len(told) > 1 else ""
 
 
-def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -> bool:
-    """Whether the constant is one of a body beyond doubt.
+def _of_body(case: _Case, fixed: Evaluation, angle: float) -> bool:
+    """Whether the constant is one of a body beyond doubt, and leaves little to be explained.
 
     A constant error of a filter is one in its world, where a turn moves positions as well: it is
     one of the body if positions are no worse for it, or the body turns against its world.
     """
-    turns = np.array([name.startswith("r") for name in found.names])
+    poses, turns = case.poses, np.array([name.startswith("r") for name in case.found.names])
     ratio, left = (
         np.sqrt(np.mean((x.errors[x.logged] / x.sigmas[x.logged]) ** 2, axis=0))
-        for x in (found, fixed)
+        for x in (case.found, fixed)
     )
     n = poses.estimates.shape[-1] - 1
     R = poses.estimates[:, :, :n, :n][poses.logged]
@@ -323,12 +328,13 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
     constant = _angles(axis @ _mean_rotation(axis).T)
     in_world = turns.any() and _rms(constant) < 0.5 * angle
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
-    return bool((ratio > LESS).any() and (ratio > LESS * left).any() and not (in_world and few))
+    explained = (ratio > LESS) & (ratio > LESS * left)
+    return bool(explained.any() and left.max() < UNEXPLAINED and not (in_world and few))
 
 
-def _in_all_runs(X: Float[np.ndarray, "d d"], moved: Poses) -> bool:
+def _in_all_runs(X: Float[np.ndarray, "d d"], case: _Case, unmounted: Poses) -> bool:
     """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
-    n = len(X) - 1
+    n, moved = len(X) - 1, _in_world(case, unmounted)
 
     def parts(T: Matrices) -> np.ndarray:
         S = T[:, :n, :n] - np.swapaxes(T[:, :n, :n], 1, 2)
@@ -350,29 +356,26 @@ def _unmounted(poses: Poses, X: Float[np.ndarray, "d d"]) -> Poses:
     return poses._replace(truths=np.where(poses.logged[..., None, None], moved, poses.truths))
 
 
-def _half_angles(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Mistake | None:
+def _half_angles(case: _Case) -> Mistake | None:
     """Covariances of the vector part of a quaternion: σ of all rotations is half, and no other."""
-    factors = {name: found.axis_verdict(i) for i, name in enumerate(found.names)}
-    for name, verdict in factors.items():
+    for i, name in enumerate(case.found.names):
+        verdict = case.found.axis_verdict(i)
         low, high = verdict["interval99"]
         factor = 2.0 if name.startswith("r") else 1.0
         if not (low and high and low <= 1.05 * factor and high >= 0.95 * factor):
             return None
         if factor == 2.0 and not (1.8 < verdict["sigma_factor"] < 2.2):
             return None
-    names: Sequence[str] = convention.names(geometry_of(poses.estimates))
+    names: Sequence[str] = case.convention.names(geometry_of(case.poses.estimates))
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in names])
-    fixed = compared(
-        poses._replace(covariances=scale[:, None] * poses.covariances * scale), align, ()
-    )
+    P = scale[:, None] * case.poses.covariances * scale
+    fixed = case.again(case.poses._replace(covariances=P))
     if not _right(fixed):
         return None
     return Mistake(
         "half angles",
         "σ of all rotations is half of the right one, and that of positions right, as if the "
         f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
-        f"header {_instead(found, fixed)}. If they are of angles, the filter is over-confident",
+        f"header {case.instead(fixed)}. If they are of angles, the filter is over-confident",
         _nees(fixed),
     )

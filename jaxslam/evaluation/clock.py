@@ -53,10 +53,10 @@ def clock_offset(
     if len(true_times) < _LEAST or len(times) < _LEAST:
         return None
     step = float(np.median(np.diff(true_times)))
-    own = _increments(estimates)
+    own = increments(estimates)
 
     def residuals(late: float) -> Float[np.ndarray, "k r"]:
-        theirs = _increments(interpolated(true_times, truths, times - late))
+        theirs = increments(interpolated(true_times, truths, times - late))
         there = ~np.isnan(theirs).any(axis=1)
         if there.sum() < _LEAST:
             return np.full_like(own, np.nan)
@@ -96,7 +96,7 @@ def _sigma(before: np.ndarray, now: np.ndarray, after: np.ndarray, apart: float)
     return float(np.sqrt(variance)) / information if information > 0 else np.inf
 
 
-def _increments(T: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "k r"]:
+def increments(T: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "k r"]:
     """The rotation vectors from each pose to the next; NaN where one of both is."""
     from scipy.spatial.transform import Rotation  # slow to import
 

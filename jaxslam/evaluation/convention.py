@@ -180,8 +180,12 @@ def converted(
     new: Convention,
 ) -> Float[np.ndarray, "*batch t t"]:
     """Convert covariances of poses from one convention to another."""
-    J = change(poses, old, new)
-    return J @ covariances @ np.swapaxes(J, -1, -2)
+    T, P = (x.reshape(-1, *x.shape[-2:]) for x in (poses, covariances))
+    result = np.empty(P.shape)
+    for part in blocks(len(T)):
+        J = change(T[part], old, new)
+        result[part] = J @ P[part] @ np.swapaxes(J, -1, -2)
+    return result.reshape(covariances.shape)
 
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:

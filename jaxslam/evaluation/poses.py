@@ -184,7 +184,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
     elif align == "sim3":
-        scale = of_aligned(later, convention, axes, _log_scales(poses, world.poses))
+        scale = of_aligned(later, convention, axes, world.log_scale)
     return _PoseErrors(
         errors, P, whitened(errors, P), start, later.logged, fitted, axis_fitted, scale, notes
     )
@@ -216,16 +216,6 @@ def _with_truth(
     if world.given:
         log_scale = np.nan_to_num(at_one_scale(later, convention, axes).scale.log_scale)
     return with_truth(later, convention, truth_sigma, np.exp(log_scale), firsts)
-
-
-def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
-    """The log of the estimate's unit relative to the truth's, of what a Sim(n) did to each run."""
-    spreads = (
-        [np.linalg.norm(p[own] - p[own].mean(0)) for p, own in zip(x, before.logged, strict=True)]
-        for x in (before.estimates[..., :-1, -1], after.estimates[..., :-1, -1])
-    )
-    old, new = (np.log(spread) for spread in spreads)
-    return old - new
 
 
 def _identified(poses: Poses, stated: Convention, options: _Options) -> Identification:

@@ -17,8 +17,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
-from jaxslam.evaluation.alignment import about
-from jaxslam.evaluation.convention import Axes, Convention, Joints, Matrices, Tangents, pose_errors
+from jaxslam.evaluation.convention import (
+    Axes,
+    Convention,
+    Joints,
+    Matrices,
+    Tangents,
+    converted,
+    pose_errors,
+)
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.bands import Mask, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
@@ -247,11 +254,14 @@ def of_aligned(
     poses: Poses, convention: Convention, axes: Axes, log_scale: Float[np.ndarray, " runs"]
 ) -> Scale:
     """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
-    T, P, truth = (x.copy() for x in poses[:3])
-    for run, logged in enumerate(poses.logged):
-        one = Poses(T[run], P[run], truth[run], logged)
-        moved = about(one, convention, truth[run, logged, :-1, -1].mean(axis=0))
-        T[run], P[run], truth[run] = moved[:3]
+    T, truth = poses.estimates.copy(), poses.truths.copy()
+    there = poses.logged[..., None, None]
+    middle = np.mean(truth, axis=1, where=there, keepdims=True)[..., :-1, -1]
+    for x in (T, truth):
+        x[..., :-1, -1] -= middle
+    split = Convention("split")
+    P = converted(poses.covariances, poses.estimates, convention, split)
+    P = converted(P, T, split, convention)
     e, g = (x[..., axes] for x in _affine(convention, T, truth))
     _, own_scale, sigma = _own_scales(e, g, P[..., axes[:, None], axes])
     told = poses.logged & np.isfinite(sigma)
