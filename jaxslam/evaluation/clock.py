@@ -48,8 +48,10 @@ def clock_offset(
 
     Of a grid as fine as the truth the best one, refined by a parabola through its neighbours.
     """
-    known = ~np.isnan(truths[:, 0, 0])
-    true_times, truths = true_times[known], truths[known]
+    (times, estimates), (true_times, truths) = (
+        (t[~np.isnan(T[:, 0, 0])], T[~np.isnan(T[:, 0, 0])])
+        for t, T in ((times, estimates), (true_times, truths))
+    )
     if len(true_times) < _LEAST or len(times) < _LEAST:
         return None
     step = float(np.median(np.diff(true_times)))

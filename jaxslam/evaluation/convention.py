@@ -367,7 +367,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     if deviations:
         expected = f"{count} finite numbers, OpenVINS's time and deviations"
     there = ~without_values(rows)
-    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & ~np.isfinite(rows).all(axis=1))
+    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1))
     if wrong.size or not (deviations or count in kinds):
         raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
     try:

@@ -56,7 +56,10 @@ def check_finite(what: str, array: Float[np.ndarray, ...], logged: Mask | None =
         wrong &= logged.reshape(*logged.shape, *[1] * (array.ndim - 2))
     if wrong.any():
         place = np.argwhere(wrong)[0]
-        raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
+        unknown = " (inf is of an axis that is unknown at every pose)" * (array.ndim == 4)
+        raise ValueError(
+            f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers{unknown}"
+        )
 
 
 def all_nan(array: Values) -> Mask:
@@ -215,7 +218,10 @@ def without_known(
     before = np.logical_and.accumulate(known | in_part | ~logged, axis=1)
     if before.all(axis=1).any():
         run = int(np.argmax(before.all(axis=1)))
-        raise ValueError(f"all covariances of run {run} are zero; they must be positive definite")
+        raise ValueError(
+            f"all covariances of run {run} are zero, or zero on an axis without errors; they must "
+            "be positive definite"
+        )
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
     return EvaluatedSteps(start, left, _left_out(logged & before, start))
@@ -359,7 +365,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
             f"{joint}, not {P.shape}"
         )
-    joints = P if P.shape == joint else None
+    joints, P = (P, P) if P.shape == joint else (None, without_unknown(P))
     if joints is not None:
         blocks = joints.reshape(runs, steps, t, steps, t)
         P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)

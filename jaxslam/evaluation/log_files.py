@@ -14,13 +14,12 @@ from jaxslam.evaluation.causes import suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
-from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run, with_other
+from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, paired, read_run, with_other
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, described, evaluate, evaluate_nees
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.tracked_frames import left_out
 from jaxslam.io import ros
-from jaxslam.io.logs import read_log
 from jaxslam.io.text import read_table
 
 _CONTENTS = (
@@ -173,18 +172,19 @@ def runs_of(
             raise ValueError(f"{source}: a bag has its own covariances; leave out --covariance")
         own, true = estimate or "", str(truth or "")
         told = [ros.chosen(bag, own, ros.WITH_COVARIANCE, "--estimate", true) for bag in bags]
-        return tuple(RunFiles(x.parent.stem, x, x, _truth_of(true, x.parent, x.name)) for x in told)
+        return tuple(
+            RunFiles(x.parent.stem, x, None, _truth_of(true, x.parent, x.name)) for x in told
+        )
     if estimate is not None:
         raise ValueError(f"{source}: --estimate is for {ros.BAG}, which this is not")
     if not source.is_dir():
-        covariance = covariance or _own_covariances(source)
-        for name, value in (("covariance", covariance), ("truth", truth)):
-            if value is None:
-                raise ValueError(
-                    f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); "
-                    "arrays need a .npz or .csv file"
-                )
-        return (RunFiles(source.stem, source, Path(str(covariance)), _truth_of(str(truth))),)
+        if truth is None:
+            raise ValueError(
+                f"{source}: a trajectory needs a truth file (--truth FILE) and, unless its own "
+                "lines hold them, one of covariances (--covariance FILE); arrays need a .npz or "
+                ".csv file"
+            )
+        return (RunFiles(source.stem, source, _path(covariance), _truth_of(str(truth))),)
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
             raise ValueError(
@@ -199,9 +199,8 @@ def runs_of(
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
-def _own_covariances(estimate: Path) -> Path | None:
-    """The file itself, where its lines have the covariances of their poses too."""
-    return estimate if len(read_log(estimate).covariances) else None
+def _path(given: str | Path | None) -> Path | None:
+    return None if given is None else Path(given)
 
 
 def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles, ...]:
@@ -213,7 +212,7 @@ def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles,
             f"{source} has neither {ESTIMATES[0]} nor sub-folders, one per run, nor trajectories "
             f"beside one {TRUTHS[0]}"
         )
-    return tuple(RunFiles(path.stem, path, path, _truth_of(str(true))) for path in files)
+    return tuple(RunFiles(path.stem, path, None, _truth_of(str(true))) for path in files)
 
 
 def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
@@ -227,16 +226,15 @@ def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
 
 
 def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> RunFiles:
-    def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
-        path = _only(folder, names) if given is None else Path(given)
+    def found(names: tuple[str, ...]) -> Path:
+        path = _only(folder, names)
         if path is None:
             raise ValueError(f"{folder} has no {' or '.join(names)}")
         return path
 
-    true = found(None, TRUTHS) if truth is None else _truth_of(str(truth))
-    estimate = found(None, ESTIMATES)
-    files = estimate, found(covariance or _own_covariances(estimate), COVARIANCES), true
-    return RunFiles(folder.resolve().name, *files)
+    true = found(TRUTHS) if truth is None else _truth_of(str(truth))
+    P = _path(covariance) or _only(folder, COVARIANCES)
+    return RunFiles(folder.resolve().name, found(ESTIMATES), P, true)
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
@@ -263,29 +261,29 @@ def evaluate_runs(
 
     `how` are the options of `evaluate_poses`; for the others see `evaluate_log`.
     """
-    read = [read_run(run, time_offset) for run in runs]
+    read = [paired(read_run(run), time_offset) for run in runs]
     convention = _convention_of(read, stated)
     if against:
         read = [with_other(one, convention) for one in read]
     for one in read:
         if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
-                f"{one.run.estimate}: its longest map is map {one.evaluated.map}, in a unit of its "
-                "own; use --align sim3"
+                f"{one.logs.files.estimate}: its longest map is map {one.evaluated.map}, in a unit "
+                "of its own; use --align sim3"
             )
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
     names = tuple(run.name for run in runs)
     longest = max(read, key=lambda one: len(one.times))
     told: tuple[str, ...] = ()
-    if not all(one.oriented for one in read) and not how["axes_used"]:
+    if not all(one.logs.oriented for one in read) and not how["axes_used"]:
         how = {**how, "axes_used": ("x", "y", "z")}
         told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
     place = runs[0].estimate if len(runs) == 1 else source
     found = named(place, lambda: _compared(read, convention, how), names)
     if late := _clocks(read, found):
         offset, sigma = late
-        again = [read_run(run, offset) for run in runs]
+        again = [paired(one.logs, offset) for one in read]
         fixed = _compared(again, convention, how)
         before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
         if after < before / CLEARLY:
@@ -303,7 +301,7 @@ def evaluate_runs(
     told += (
         *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
-    if not read[0].said and not stated:
+    if not read[0].logs.covariances.said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
     return described(found, notes=(*found.notes, *told), run_names=names)
 
@@ -329,7 +327,7 @@ def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None
 
 def _all_runs(read: list[RunLog]) -> tuple[float, float] | None:
     """The mean offset of the runs' clocks, and its σ; None where rotations do not tell it."""
-    told = (one.offset for one in read[:LOOKED_AT])
+    told = (one.logs.offset for one in read[:LOOKED_AT])
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None
@@ -352,13 +350,15 @@ def _remarks(read: list[RunLog]) -> Iterator[str]:
 
 def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
     """The convention of all runs. Raises ValueError where their files say different ones."""
-    for one in read:
-        if one.said != read[0].said:
+    first = read[0].logs
+    for one in (one.logs for one in read):
+        if one.covariances.said != first.covariances.said:
             raise ValueError(
-                f"{one.run.covariance} states a different convention ({Convention(**one.said)}) "
-                f"from {read[0].run.covariance} ({Convention(**read[0].said)})"
+                f"{one.files.of_covariances} states a different convention "
+                f"({one.covariances.convention}) from {first.files.of_covariances} "
+                f"({first.covariances.convention})"
             )
-    return stated_before(read[0].said, stated)
+    return stated_before(first.covariances.said, stated)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
@@ -410,6 +410,6 @@ def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
         if np.abs(since(one, steps) - since(longest, steps)).max() > MAX_TIME_DIFFERENCE:
             yield (
                 "steps are counted from the first pose of each run; their times differ between "
-                f"runs, and are those of {longest.run.name}"
+                f"runs, and are those of {longest.logs.files.name}"
             )
             return

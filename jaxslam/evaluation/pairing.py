@@ -7,6 +7,8 @@ time; and where it is much rarer than the estimate, the estimate is moved to its
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -46,35 +48,50 @@ class RunFiles(NamedTuple):
 
     name: str
     estimate: Place
-    covariance: Place
+    covariance: Path | None
+    """None of an estimate whose own lines, or messages, hold covariances."""
     truth: Place
+
+    @property
+    def of_covariances(self) -> Place:
+        """Where covariances are."""
+        return self.covariance or self.estimate
+
+
+@dataclass(frozen=True, eq=False)
+class RunLogs:
+    """What the files of a run hold, each with its own stamps."""
+
+    files: RunFiles
+    estimate: Log
+    truth: Log
+    covariances: CovarianceText
+    oriented: bool
+    """Whether estimate and truth have orientations."""
+    notes: tuple[str, ...]
+
+    @cached_property
+    def offset(self) -> Offset | None:
+        """By how much the estimate is late, by its rotations."""
+        own, true = self.estimate, self.truth
+        if not self.oriented or not own.stamped:
+            return None
+        return clock_offset(own.times, own.poses, true.times, true.poses)
 
 
 class RunLog(NamedTuple):
     """A run, pose by pose of its estimate; NaN where a file holds nothing."""
 
-    run: RunFiles
+    logs: RunLogs
     times: Float[np.ndarray, " n"]
     estimates: Float[np.ndarray, "n d d"]
     covariances: Float[np.ndarray, "n t t"]
     truths: Float[np.ndarray, "n d d"]
-    said: dict[str, str]
     evaluated: EvaluatedPoses
     """The poses that have a part in the verdict, by the tracker's own record of its frames."""
-    oriented: bool
     left_out: dict[str, tuple[int, int]]
     """What is left out: how many, and of how many."""
     notes: tuple[str, ...]
-    raw: tuple[Log, Log]
-    """The estimate as it is stamped, and the truth."""
-
-    @property
-    def offset(self) -> Offset | None:
-        """By how much the estimate is late, by its rotations."""
-        own, true = self.raw
-        if not self.oriented or not own.stamped:
-            return None
-        return clock_offset(own.times, own.poses, true.times, true.poses)
 
 
 def read(place: Place) -> Log:
@@ -103,11 +120,8 @@ def _last_of_each(times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
     return np.flatnonzero(np.append(np.diff(times) > 0, True))
 
 
-def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
-    """Read one run, whose clock is behind the truth's by an offset in seconds, or `auto`.
-
-    Raises ValueError where few poses can be compared.
-    """
+def read_run(run: RunFiles) -> RunLogs:
+    """Read the files of one run. Raises ValueError where they do not go together."""
     log, truth = read(run.estimate), read(run.truth)
     if geometry_of(truth.poses) is not geometry_of(log.poses):
         raise ValueError(f"{run.truth}: estimate and truth must both be planar or both be spatial")
@@ -117,58 +131,52 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
             "not both have stamps: lines would be paired by their numbers; give times (times.txt "
             "beside them, or lines of TUM)"
         )
-    if run.covariance == run.estimate:
-        if not len(log.covariances):
-            raise ValueError(f"{run.estimate} has no covariances; give them by --covariance FILE")
-        text, notes = CovarianceText(log.times, log.covariances, dict(log.said)), ()
-    else:
-        dimension = geometry_of(log.poses).tangent_dim
-        text, notes = covariances_of_file(Path(str(run.covariance)), dimension)
+    text, notes = CovarianceText(log.times, log.covariances, dict(log.said)), ()
+    if run.covariance is not None:
+        text, notes = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
         text, rounded = _stamped_by(log.times, text)
         notes += rounded
         _check_times(run.covariance, text.times)
         last = _last_of_each(text.times)
         text = text._replace(times=text.times[last], covariances=text.covariances[last])
-    P, used = _nearest(run, log.times, text)
-    if isinstance(run.covariance, ros.Topic):
-        P = _filled_in(run.covariance, P)
+    elif not len(log.covariances):
+        raise ValueError(
+            f"{run.estimate} has no covariances, and beside it there is no covariance.txt or "
+            "state_deviation.txt; give them by --covariance FILE"
+        )
+    there = ~np.isnan(log.poses[:, 0, 0])
+    oriented, told = _oriented(log._replace(poses=log.poses[there]), truth)
+    notes = (*log.notes, *truth.notes, *notes, *_other_frames(log, truth), *told)
+    return RunLogs(run, log, truth, text, oriented, notes)
+
+
+def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
+    """The poses of a run at the same times, whose clock is behind the truth's by an offset in
+    seconds, or `auto`. Raises ValueError where few poses can be compared.
+    """
+    log, text, notes = logs.estimate, logs.covariances, list(logs.notes)
+    P, used = _nearest(logs.files, log.times, text)
+    if isinstance(logs.files.estimate, ros.Topic) and logs.files.covariance is None:
+        P = _filled_in(logs.files.estimate, P)
     there = ~np.isnan(log.poses[:, 0, 0])
     left_out = _counted("poses of the estimate are NaN", ~there)
-    log, P = log._replace(times=log.times[there], poses=log.poses[there]), P[there]
-    notes = [*log.notes, *truth.notes, *notes, *_other_frames(log, truth)]
-    oriented, told = _oriented(log, truth)
-    notes += told
-    raw, times = log, log.times
     if time_offset == "auto":
-        found = clock_offset(times, log.poses, truth.times, truth.poses) if oriented else None
+        found = logs.offset
         time_offset = found.seconds if found is not None and found.found else 0.0
         told = (
             f"taken to be {1e3 * time_offset:.1f} ms late, as found" if time_offset else "in time"
         )
         notes.append(f"the estimate is {told}")
-    times = times - float(time_offset)
-    log = log._replace(times=times)
-    true, estimates, more = _truths(run, log, truth, P, Convention(**text.said), oriented=oriented)
-    notes += more
+    times, P = log.times[there] - float(time_offset), P[there]
+    log = log._replace(times=times, poses=log.poses[there])
+    true, estimates, more = _truths(logs, log, P)
     left_out |= _counted(f"poses have no covariance {_WITHIN}", np.isnan(P[:, 0, 0]))
     left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
     if unused := len(text.times) - used:
         left_out["covariances are at no time of the estimate"] = unused, len(text.times)
-    those = evaluated_poses(run.estimate.parent, log.times, exactly_known(P))
-    result = RunLog(
-        run,
-        times,
-        estimates,
-        P,
-        true,
-        text.said,
-        those,
-        oriented,
-        left_out,
-        tuple(notes),
-        (raw, truth),
-    )
-    _check_share(result, text.times, truth.times)
+    those = evaluated_poses(logs.files.estimate.parent, times, exactly_known(P))
+    result = RunLog(logs, times, estimates, P, true, those, left_out, (*notes, *more))
+    _check_share(result, more)
     return result
 
 
@@ -177,15 +185,15 @@ def with_other(read: RunLog, convention: Convention) -> RunLog:
 
     Raises ValueError where that has none.
     """
-    other = read.raw[1]
+    other, place = read.logs.truth, read.logs.files.truth
     if not len(other.covariances):
-        raise ValueError(f"{read.run.truth} has no covariances; --against needs a log with its own")
+        raise ValueError(f"{place} has no covariances; --against needs a log with its own")
     at, of = associated(read.times, other.times)
     P = np.full_like(read.covariances, np.nan)
     said = Convention(**other.said)
     P[at] = converted(other.covariances[of], other.poses[of], said, convention)
     note = (
-        f"compared with {read.run.truth}, whose covariances are added: if the errors of both are "
+        f"compared with {place}, whose covariances are added: if the errors of both are "
         "alike, as of one sensor, their difference is smaller than this says"
     )
     return read._replace(covariances=read.covariances + P, notes=(*read.notes, note))
@@ -227,7 +235,7 @@ def _nearest(
     """The covariances at our times, and how many are. Raises ValueError where there is none."""
     at, of = associated(times, text.times)
     if not len(at):
-        raise ValueError(_nothing_in_common(run.estimate, run.covariance, times, text.times))
+        raise ValueError(_nothing_in_common(run.estimate, run.of_covariances, times, text.times))
     result = np.full((len(times), *text.covariances.shape[1:]), np.nan)
     nearest_last = np.argsort(-np.abs(times[at] - text.times[of]), kind="stable")
     result[at[nearest_last]] = text.covariances[of[nearest_last]]
@@ -287,18 +295,13 @@ def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
 
 
 def _truths(
-    run: RunFiles,
-    log: Log,
-    truth: Log,
-    P: Float[np.ndarray, "n t t"],
-    convention: Convention,
-    *,
-    oriented: bool,
+    logs: RunLogs, log: Log, P: Float[np.ndarray, "n t t"]
 ) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"], list[str]]:
     """The true poses of every estimate, NaN where there is none, the estimates, and remarks.
 
     Raises ValueError where there is none.
     """
+    run, truth, oriented = logs.files, logs.truth, logs.oriented
     known = ~np.isnan(truth.poses[:, 0, 0])
     times, poses = truth.times[known], truth.poses[known]
     gap = np.median(np.diff(times)) if len(times) > 1 else 0.0
@@ -311,7 +314,7 @@ def _truths(
         return _some(run, log, truth, nearest), log.poses, []
     off = np.abs(log.times[at] - times[of]).max() if len(at) else np.inf
     wrong = _interpolation_error(times, poses)
-    sigma = _sigmas(log, P, convention)
+    sigma = _sigmas(log, P, logs.covariances.convention)
     most = (wrong / sigma)[: 2 if oriented else 1].max()
     if off > 1e-6 * max(gap, step) and most <= DENSE and gap <= SPARSE * step:
         whole = interpolated(times, poses, log.times)
@@ -337,7 +340,13 @@ def _truths(
         moved, true = _at_stamps_of_truth(log, times, poses)
         if rough <= DENSE:
             return _some(run, log, truth, true), moved, [note]
-    return _some(run, log, truth, nearest), log.poses, []
+    rough = off > 1e-6 * max(gap, step) and most > DENSE and gap <= SPARSE * step
+    note = (
+        f"the truth, a pose every {gap:.3g} s, is not interpolated to the estimate's stamps, every "
+        f"{step:.3g} s: between its poses it is known to {most:.2g} of the estimate's σ only; a "
+        "denser truth would be, or log the estimate at its stamps"
+    )
+    return _some(run, log, truth, nearest), log.poses, [note] if rough else []
 
 
 def _some(run: RunFiles, log: Log, truth: Log, poses: np.ndarray) -> np.ndarray:
@@ -391,11 +400,12 @@ def _at_stamps_of_truth(
     return moved, true
 
 
-def _check_share(read: RunLog, covariance_times: np.ndarray, true_times: np.ndarray) -> None:
-    """Raise ValueError where most of a run would not be compared."""
+def _check_share(read: RunLog, why: list[str]) -> None:
+    """Raise ValueError where most of a run would not be compared, and say why."""
+    logs = read.logs
     others = (
-        (read.run.covariance, covariance_times, ~np.isnan(read.covariances[:, 0, 0])),
-        (read.run.truth, true_times, ~np.isnan(read.truths[:, 0, 0])),
+        (logs.files.of_covariances, logs.covariances.times, ~np.isnan(read.covariances[:, 0, 0])),
+        (logs.files.truth, logs.truth.times, ~np.isnan(read.truths[:, 0, 0])),
     )
     there: Bool[np.ndarray, " n"] = others[0][2] & others[1][2]
     fewest = min(len(read.times), *(len(times) for _, times, _ in others))
@@ -409,11 +419,11 @@ def _check_share(read: RunLog, covariance_times: np.ndarray, true_times: np.ndar
     beside = times[np.minimum([after - 1, after], len(times) - 1)]
     away = float(np.median(np.abs(beside - read.times).min(axis=0)))
     raise ValueError(
-        f"{read.run.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
+        f"{logs.files.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
         f"{np.sum(others[0][2])} have a covariance {_WITHIN}, and "
         f"{np.sum(others[1][2])} a truth. {path} has {_held(times)}; the nearest one "
         f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
-        "covering half the duration of the estimate"
+        "covering half the duration of the estimate" + "".join(f". Here {x}" for x in why)
     )
 
 

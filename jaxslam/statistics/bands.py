@@ -205,7 +205,8 @@ def whiteness_p_value(nis: PerStep, normalised: PerAxis) -> float | None:
     series = [*np.moveaxis(normalised, -1, 0), nis - np.mean(nis, where=there)]
     with np.errstate(over="ignore", invalid="ignore"):
         p = [_portmanteau(np.where(there, x, 0.0), there, lags) for x in series]
-    return min(1.0, len(p) * float(np.nanmin(p)))
+    known = [x for x in p if not math.isnan(x)]  # of an axis that is always zero it is not
+    return min(1.0, len(p) * float(min(known))) if known else None
 
 
 def _portmanteau(values: np.ndarray, there: np.ndarray, lags: int) -> float:

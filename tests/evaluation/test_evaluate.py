@@ -153,6 +153,14 @@ def test_innovations_have_a_nis():
     assert found.asdict()["quantity"] == "NIS"
 
 
+def test_an_innovation_that_is_always_zero_is_no_reason_to_warn():
+    e, P = drawn()
+    e[..., 1] = 0.0
+    found = jaxslam.evaluate(e, P, quantity="NIS")
+    assert found.axis_verdict(1)["white"] is None
+    assert found.headline.startswith("NIS ")
+
+
 def autoregressive(steps, correlation, seed=0):
     """One run of innovations (1, steps, 2) and their covariances, correlated so."""
     rng = np.random.default_rng(seed)

@@ -196,7 +196,7 @@ OF_FILES = [
     (of_errors(truth_sigma=(1, 1)), "σ of the truth apply to poses"),
     (of_errors(truth="t.txt"), "--truth goes with a trajectory"),
     (of_errors(nis=True, innovations="a.npz"), "--innovations FILE, not both"),
-    (pose_alone, "needs a covariance file"),
+    (pose_alone, r"needs a truth file .* one of covariances \(--covariance FILE\)"),
     (lambda x: pose_alone(x, nis=True), "innovations must be in an npz or CSV file"),
     (plane_and_space, r"truth\.txt: estimate and truth must both be planar"),
     (lambda x: evaluate_log(x / "missing.npz"), "no such file or folder"),
@@ -301,6 +301,11 @@ OF_FOLDERS = [
     (stated(np.eye(6)), "states a different convention"),
     (stated(-np.eye(6), Convention()), ": the covariance of run01, step 0 has variance -1"),
     (times(offset=0.05), r"truth\.txt have no time stamps in common"),
+    (
+        shown(lambda t: f"{(t - 1.4e9) * 1e5:.0f}"),  # a hundred a second, in microseconds
+        r"times 1e.04 from one to the next look like microseconds or milliseconds; expected "
+        r"seconds; a title such as `t \[us\]` says which",
+    ),
     (shown(lambda t: f"{t * 1e8:.0f}"), r"1\.4e.17 look like nanoseconds; expected seconds"),
     (
         shown(lambda t: f"{t:g}"),

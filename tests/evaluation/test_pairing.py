@@ -1,5 +1,7 @@
 """Which true pose and which covariance belong to an estimate, and what has a degree of freedom."""
 
+import re
+
 import numpy as np
 import pytest
 from log_faults import flight
@@ -36,6 +38,15 @@ def test_a_truth_at_other_stamps_is_interpolated(true, tmp_path):
     )
 
 
+def test_a_truth_that_is_too_rare_to_be_interpolated_is_refused_with_the_reason(tmp_path):
+    """At 14 Hz, of an estimate at 10 Hz: few stamps meet."""
+    with pytest.raises(ValueError, match="can be compared") as caught:
+        evaluate_log(files(tmp_path, slice(0, None, 7)))
+    told = str(caught.value)
+    assert "a pose every 0.07 s, is not interpolated to the estimate's stamps, every 0.1 s" in told
+    assert re.search(r"known to [\d.]+ of the estimate's σ only; a denser truth would be", told)
+
+
 def test_no_truth_is_made_up_across_a_hole_or_beyond_the_ends(tmp_path):
     true = np.r_[5:98, 132:248]
     found = evaluate_log(files(tmp_path, true))
@@ -61,7 +72,7 @@ def test_where_the_truth_is_rare_its_stamps_are_those_that_are_compared(tmp_path
     assert "compared at the stamps of the truth" in str(found)
 
 
-@pytest.mark.parametrize("value", [-1.0, 1e12, 1.797e308])
+@pytest.mark.parametrize("value", [-1.0, 1e12, 1.797e308, np.inf])
 def test_axes_of_unknown_variance_have_no_degree_of_freedom(value, tmp_path):
     T, P, truth, nees = planar(runs=1, steps=30)
     times, P = np.arange(30) / 10, P[0].copy()
@@ -73,6 +84,13 @@ def test_axes_of_unknown_variance_have_no_degree_of_freedom(value, tmp_path):
     found = evaluate_log(tmp_path)
     assert found.names == ("x", "y", "rz")
     np.testing.assert_allclose(found.nees, nees, rtol=1e-4)
+    of_arrays = evaluate_poses(T, P[None], truth, Convention("split"))
+    np.testing.assert_allclose(of_arrays.nees, nees, rtol=1e-4)
+    rows[7, 12] = 1.0
+    np.savetxt(tmp_path / "covariance.txt", rows, header="error=split axes=world")
+    if np.isinf(value):
+        with pytest.raises(ValueError, match="holds inf; only finite numbers .inf is of an axis"):
+            evaluate_log(tmp_path)
 
 
 def test_what_a_first_pose_knows_exactly_has_no_degree_of_freedom():

@@ -13,6 +13,7 @@ from jaxslam.io.text import Table
 from jaxslam.io.tum import of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 STEPS = (1e-3, 10.0)
 """The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
@@ -67,7 +68,7 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if covariances is None else covariances
-    wrong = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
+    wrong = np.flatnonzero(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
     if wrong.size:
         raise ValueError(f"{table.place(wrong[0])}: expected a covariance of finite numbers")
     times, notes = in_seconds(table, times, unit)
@@ -98,24 +99,34 @@ def in_seconds(
 
 def unit_of(times: Float[np.ndarray, " n"]) -> str | None:
     """The only unit of time in which they are `STEPS` apart; None where there is none, or two."""
-    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-    fit = [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+    fit = units_of(times)
     return fit[0] if len(fit) == 1 else None
+
+
+def units_of(times: Float[np.ndarray, " n"]) -> list[str]:
+    """The units of time in which they are `STEPS` apart."""
+    step = _step(times)
+    return [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+
+
+def _step(times: Float[np.ndarray, " n"]) -> float:
+    return float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
 
 
 def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
     """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
-    last = float(np.abs(times).max())
-    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    last, step = float(np.abs(times).max()), _step(times)
     # Seconds between two poses, more than a moving thing has.
     if last <= _LATEST and step <= 1e3:
         return
-    by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
-    by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))
-    size, units = (last, by_size) if last > _LATEST else (step, by_step)
-    unit = next(unit for least, unit in units if size >= least)
-    told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
-    raise ValueError(f"{what}: times {told} look like {unit}; expected seconds")
+    told = f"{step:.3g} from one to the next"
+    units = [NAMES[unit] for unit in units_of(times)] or ["another unit"]
+    if last > _LATEST:
+        told = f"up to {last:.3g}"
+        sizes = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
+        units = [next(unit for least, unit in sizes if last >= least)]
+    ask = "; a title such as `t [us]` says which" if len(units) > 1 else ""
+    raise ValueError(f"{what}: times {told} look like {' or '.join(units)}; expected seconds{ask}")
 
 
 def symmetric(
