@@ -36,6 +36,8 @@ TURNED = np.radians(60)
 """A rotation between worlds that is no error of a filter's first heading."""
 UNEXPLAINED = 5.0
 """Errors that a constant leaves, in σ of the worst axis, beyond which the filter is wrong."""
+HALF = 1.3
+"""How near σ of all rotations, or positions, is to half angles (the right ones), as a factor."""
 MANY = 10
 """Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
@@ -358,14 +360,16 @@ def _unmounted(poses: Poses, X: Float[np.ndarray, "d d"]) -> Poses:
 
 def _half_angles(case: _Case) -> Mistake | None:
     """Covariances of the vector part of a quaternion: σ of all rotations is half, and no other."""
+    off: dict[float, list[float]] = {1.0: [], 2.0: []}
     for i, name in enumerate(case.found.names):
-        verdict = case.found.axis_verdict(i)
-        low, high = verdict["interval99"]
-        factor = 2.0 if name.startswith("r") else 1.0
-        if not (low and high and low <= 1.05 * factor and high >= 0.95 * factor):
+        verdict, factor = case.found.axis_verdict(i), 2.0 if name.startswith("r") else 1.0
+        (low, high), own = verdict["interval99"], verdict["sigma_factor"]
+        if not own or (low or 0.0) > 1.05 * factor or (high or np.inf) < 0.95 * factor:
             return None
-        if factor == 2.0 and not (1.8 < verdict["sigma_factor"] < 2.2):
-            return None
+        off[factor].append(np.log(own / factor))
+    # Of one axis the factor scatters; an interval may be of any width.
+    if any(abs(np.mean(part)) > np.log(HALF) for part in off.values() if part):
+        return None
     names: Sequence[str] = case.convention.names(geometry_of(case.poses.estimates))
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in names])
     P = scale[:, None] * case.poses.covariances * scale

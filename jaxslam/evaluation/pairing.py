@@ -155,7 +155,10 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     seconds, or `auto`. Raises ValueError where few poses can be compared.
     """
     log, text, notes = logs.estimate, logs.covariances, list(logs.notes)
-    P, used = _nearest(logs.files, log.times, text)
+    P, at, of = _nearest(log.times, text.times, text.covariances)
+    if not len(at):
+        raise _nothing_in_common(logs.files, logs.files.of_covariances, log.times, text.times)
+    P = without_unknown(P[None])[0]
     if isinstance(logs.files.estimate, ros.Topic) and logs.files.covariance is None:
         P = _filled_in(logs.files.estimate, P)
     there = ~np.isnan(log.poses[:, 0, 0])
@@ -170,9 +173,11 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     times, P = log.times[there] - float(time_offset), P[there]
     log = log._replace(times=times, poses=log.poses[there])
     true, estimates, more = _truths(logs, log, P)
+    if np.isnan(true[:, 0, 0]).all():
+        raise _nothing_in_common(logs.files, logs.files.truth, times, logs.truth.times)
     left_out |= _counted(f"poses have no covariance {_WITHIN}", np.isnan(P[:, 0, 0]))
     left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
-    if unused := len(text.times) - used:
+    if unused := len(text.times) - len(np.unique(of)):
         left_out["covariances are at no time of the estimate"] = unused, len(text.times)
     those = evaluated_poses(logs.files.estimate.parent, times, exactly_known(P))
     result = RunLog(logs, times, estimates, P, true, those, left_out, (*notes, *more))
@@ -230,21 +235,23 @@ def _stamped_by(
 
 
 def _nearest(
-    run: RunFiles, times: Float[np.ndarray, " n"], text: CovarianceText
-) -> tuple[Float[np.ndarray, "n t t"], int]:
-    """The covariances at our times, and how many are. Raises ValueError where there is none."""
-    at, of = associated(times, text.times)
-    if not len(at):
-        raise ValueError(_nothing_in_common(run.estimate, run.of_covariances, times, text.times))
-    result = np.full((len(times), *text.covariances.shape[1:]), np.nan)
-    nearest_last = np.argsort(-np.abs(times[at] - text.times[of]), kind="stable")
-    result[at[nearest_last]] = text.covariances[of[nearest_last]]
-    return without_unknown(result[None])[0], len(np.unique(of))
+    times: Float[np.ndarray, " n"], others: Float[np.ndarray, " m"], values: np.ndarray
+) -> tuple[np.ndarray, Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """The values of other times at ours, NaN where there is none; and which belong together."""
+    at, of = associated(times, others)
+    result = np.full((len(times), *values.shape[1:]), np.nan)
+    nearest_last = np.argsort(-np.abs(times[at] - others[of]), kind="stable")
+    result[at[nearest_last]] = values[of[nearest_last]]
+    return result, at, of
 
 
-def _nothing_in_common(one: Place, other: Place, times: np.ndarray, others: np.ndarray) -> str:
+def _nothing_in_common(
+    run: RunFiles, other: Place, times: np.ndarray, others: np.ndarray
+) -> ValueError:
     spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, others))
-    return f"{one} and {other} have no time stamps in common {_WITHIN}: {spans}"
+    return ValueError(
+        f"{run.estimate} and {other} have no time stamps in common {_WITHIN}: {spans}"
+    )
 
 
 def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndarray, "n t t"]:
@@ -301,22 +308,18 @@ def _truths(
 
     Raises ValueError where there is none.
     """
-    run, truth, oriented = logs.files, logs.truth, logs.oriented
-    known = ~np.isnan(truth.poses[:, 0, 0])
-    times, poses = truth.times[known], truth.poses[known]
-    gap = np.median(np.diff(times)) if len(times) > 1 else 0.0
-    step = np.median(np.diff(log.times)) if len(log.times) > 1 else 0.0
-    nearest = np.full_like(log.poses, np.nan)
-    at, of = associated(log.times, times)
-    order = np.argsort(-np.abs(log.times[at] - times[of]), kind="stable")
-    nearest[at[order]] = poses[of[order]]
+    oriented, known = logs.oriented, ~np.isnan(logs.truth.poses[:, 0, 0])
+    times, poses = logs.truth.times[known], logs.truth.poses[known]
+    nearest, at, of = _nearest(log.times, times, poses)
     if len(times) < 3 or not log.stamped:
-        return _some(run, log, truth, nearest), log.poses, []
+        return nearest, log.poses, []
+    gap, step = (np.median(np.diff(x)) if len(x) > 1 else 0.0 for x in (times, log.times))
     off = np.abs(log.times[at] - times[of]).max() if len(at) else np.inf
     wrong = _interpolation_error(times, poses)
     sigma = _sigmas(log, P, logs.covariances.convention)
     most = (wrong / sigma)[: 2 if oriented else 1].max()
-    if off > 1e-6 * max(gap, step) and most <= DENSE and gap <= SPARSE * step:
+    elsewhere, dense = off > 1e-6 * max(gap, step), gap <= SPARSE * step
+    if elsewhere and dense and most <= DENSE:
         whole = interpolated(times, poses, log.times)
         # Not across a hole.
         after = np.clip(np.searchsorted(times, log.times), 1, len(times) - 1)
@@ -325,34 +328,27 @@ def _truths(
             f"the truth is interpolated to the stamps of the estimate, to {1e3 * wrong[0]:.2g} mm "
             f"and {np.degrees(wrong[1]):.2g}° (median), {most:.2g} σ"
         )
-        return _some(run, log, truth, whole), log.poses, [note] if most > 0.01 else []
+        return whole, log.poses, [note] if most > 0.01 else []
     few = len(np.unique(of)) < LEAST_SHARE * len(times)
-    if gap > SPARSE * step and (few or off > 1e-6 * step):
+    if not dense and (few or off > 1e-6 * step):
         rough = (_interpolation_error(log.times, log.poses) / sigma)[: 2 if oriented else 1].max()
         told = f"the truth has a pose every {gap:.3g} s and the estimate every {step:.3g} s"
         if rough > DENSE and few:
             raise ValueError(
-                f"{run.truth}: {told}, at other stamps, and between them the estimate is known to "
-                f"{rough:.2g} of its σ only; log it at the stamps of the truth, or take a truth "
-                "that is dense enough to be interpolated"
+                f"{logs.files.truth}: {told}, at other stamps, and between them the estimate is "
+                f"known to {rough:.2g} of its σ only; log it at the stamps of the truth, or take a "
+                "truth that is dense enough to be interpolated"
             )
         note = f"{told}: compared at the stamps of the truth, to {rough:.2g} σ of the estimate"
         moved, true = _at_stamps_of_truth(log, times, poses)
         if rough <= DENSE:
-            return _some(run, log, truth, true), moved, [note]
-    rough = off > 1e-6 * max(gap, step) and most > DENSE and gap <= SPARSE * step
+            return true, moved, [note]
     note = (
         f"the truth, a pose every {gap:.3g} s, is not interpolated to the estimate's stamps, every "
         f"{step:.3g} s: between its poses it is known to {most:.2g} of the estimate's σ only; a "
         "denser truth would be, or log the estimate at its stamps"
     )
-    return _some(run, log, truth, nearest), log.poses, [note] if rough else []
-
-
-def _some(run: RunFiles, log: Log, truth: Log, poses: np.ndarray) -> np.ndarray:
-    if np.isnan(poses[:, 0, 0]).all():
-        raise ValueError(_nothing_in_common(run.estimate, run.truth, log.times, truth.times))
-    return poses
+    return nearest, log.poses, [note] if elsewhere and dense else []
 
 
 def _interpolation_error(
@@ -413,10 +409,8 @@ def _check_share(read: RunLog, why: list[str]) -> None:
     if enough and _span(read.times[there]) >= LEAST_SHARE * _span(read.times):
         return
     path, times, _ = min(others, key=lambda other: int(np.sum(other[2])))
-    after: Int[np.ndarray, " n"] = np.clip(
-        np.searchsorted(times, read.times), 1, max(len(times) - 1, 1)
-    )
-    beside = times[np.minimum([after - 1, after], len(times) - 1)]
+    after = np.searchsorted(times, read.times)
+    beside = times[np.clip([after - 1, after], 0, len(times) - 1)]
     away = float(np.median(np.abs(beside - read.times).min(axis=0)))
     raise ValueError(
         f"{logs.files.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "

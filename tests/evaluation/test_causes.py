@@ -119,6 +119,22 @@ def test_a_fault_between_the_logs_is_named_with_the_nees_without_it(logs, what, 
     assert found.headline.startswith("no verdict: ")
 
 
+@pytest.mark.parametrize("number", [5, 38])
+def test_half_angles_are_named_where_intervals_are_wide(number):
+    """Of 6 and of 29 runs, with errors that are correlated in time."""
+    said, found = benchmark.judged("half angles", 1.0, number)
+    assert said == "named"
+    assert found.verdict["word"] == "cannot tell"
+
+
+def test_a_lever_arm_that_leaves_most_of_the_errors_is_no_cause():
+    """A filter whose σ is too small by eight, of a truth with a short arm: it is over-confident."""
+    T, P, true = right(factor=8.0)
+    found = evaluate_poses(T, P, true @ body(0, (2.0, 0.0, 1.0)), SPLIT)
+    assert not found.causes
+    assert found.verdict["word"] in ("over-confident", "lost")
+
+
 def test_covariances_of_roll_pitch_and_yaw_are_told_from_those_of_a_rotation():
     logs = angles()
     as_stated = evaluate_poses(*logs, Convention("split", "world"))
