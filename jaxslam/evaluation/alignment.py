@@ -116,19 +116,14 @@ def similarity(
     """
     mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
     centred, target = estimate - mean_estimate, reference - mean_reference
-    if yaw:
-        rotation = yaw_alone(target.T @ centred)
-        return Similarity(rotation, mean_reference - rotation @ mean_estimate, 1.0)
-    left, singular, right = np.linalg.svd(target.T @ centred)
-    if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
+    M = target.T @ centred
+    if not yaw and (np.linalg.norm(M) <= 1e-12 * np.sum(target**2) or not np.any(target)):
         name = "Sim(3)" if scaled else "SE(3)"
         raise ValueError(
             f"all positions of a trajectory coincide; an alignment by {name} needs motion"
         )
-    signs = np.ones(len(singular))
-    signs[-1] = np.sign(np.linalg.det(left @ right))
-    rotation = left @ np.diag(signs) @ right
-    scale = float(singular @ signs / np.sum(centred**2)) if scaled else 1.0
+    rotation = yaw_alone(M) if yaw else nearest_rotation(M)
+    scale = float(np.sum(rotation * M) / np.sum(centred**2)) if scaled else 1.0
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 

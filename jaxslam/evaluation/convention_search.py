@@ -176,33 +176,28 @@ def identify(
     own = finite.get(stated)
     stands, whole = own is not None and own.consistent, own is not None and own.whole
     best, equal = _best(finite)
-    if best is None or not best.consistent:
+    better = None if own is None or best is None else _better(own, finite[best])
+    if best is None or not finite[best].consistent:
         free = _finite(given())
         best_free, equal = _best(free)
-        finite |= free
-        fits = best_free is not None and best_free.consistent
-        if not fits or (best is not None and not _scale_was_free(best, best_free)):
+        if (
+            best_free is None
+            or not free[best_free].consistent
+            or (best is not None and not _scale_was_free(finite[best], free[best_free]))
+        ):
             equal = ()
+        finite |= free
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
-    better = None if equal or own is None else _better(stated, own, _finite(tried))
-    return Identification(stated, means, equal, stands, whole, better)
+    others = (best, *better) if best not in (None, stated) and better and not equal else None
+    return Identification(stated, means, equal, stands, whole, others)
 
 
-def _better(
-    stated: Convention, own: Tried, tried: Mapping[Convention, Tried]
-) -> tuple[Convention, int, int] | None:
-    """The one that fits best, if better than the stated one beyond doubt, run by run."""
-    best = min(
-        tried, key=lambda c: tried[c].log_determinant / tried[c].dof + np.log(_mean(tried[c]))
-    )
-    if best == stated or not _worse(own.nees, tried[best].nees):
+def _better(own: Tried, best: Tried) -> tuple[int, int] | None:
+    """In how many runs, and of how many, the best one fits better, if it does beyond doubt."""
+    if not _worse(own.nees, best.nees):
         return None
-    lower = np.nanmean(tried[best].nees, axis=1) < np.nanmean(own.nees, axis=1)
-    return best, int(lower.sum()), len(lower)
-
-
-def _mean(tried: Tried) -> float:
-    return max(float(np.nanmean(tried.nees)), 1e-300)
+    lower = np.nanmean(best.nees, axis=1) < np.nanmean(own.nees, axis=1)
+    return int(lower.sum()), len(lower)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
@@ -211,7 +206,7 @@ def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
     return {c: last for c, x in tried.items() if (last := x.last(steps)).finite}
 
 
-def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Convention, ...]]:
+def _best(tried: Mapping[Convention, Tried]) -> tuple[Convention | None, tuple[Convention, ...]]:
     """The most likely one, and all that cannot be distinguished from it."""
     if not tried:
         return None, ()
@@ -222,7 +217,7 @@ def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Conven
         for c, x in tried.items()
         if not _worse(weight[c] / weight[best] * x.nees, tried[best].nees)
     )
-    return tried[best], equal
+    return best, equal
 
 
 def _scale_was_free(marginal: Tried, given: Tried) -> bool:

@@ -18,7 +18,6 @@ from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, paired, read_run
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, described, evaluate, evaluate_nees
 from jaxslam.evaluation.sanity_checks import Mistake
-from jaxslam.evaluation.tracked_frames import left_out
 from jaxslam.io import ros
 from jaxslam.io.text import read_table
 
@@ -70,17 +69,8 @@ def evaluate_log(
     `innovations` of the same filter, in an npz or CSV file, say what to turn (`advice`), and so do
     those alone. Raises ValueError, naming the file.
     """
-    if innovations is not None:
-        if nis:
-            raise ValueError("give --nis or --innovations FILE, not both")
-        beside = evaluate_log(innovations, nis=True)
-        own = evaluate_log(
-            source, covariance=covariance, truth=truth, estimate=estimate, stated=stated,
-            align=align, axes_used=axes_used, truth_sigma=truth_sigma, time_offset=time_offset,
-            against=against,
-        )  # fmt: skip
-        told = f"{beside.headline.partition(':')[0]} (of innovations); {advice(beside, own)}"
-        return described(own, notes=(*own.notes, told))
+    if innovations is not None and nis:
+        raise ValueError("give --nis or --innovations FILE, not both")
     (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
     estimate = estimate or topic or None
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
@@ -90,19 +80,28 @@ def evaluate_log(
         raise ValueError("give --truth or --against, not both")
     truth = against if truth is None else truth
     beside = {"covariance": covariance, "truth": truth, "estimate": estimate}
-    binary = source.suffix in ARRAYS
-    if binary or (source.is_file() and _is_table(source, beside)):
-        for name, value in beside.items():
-            if value is not None:
-                raise ValueError(f"{source}: --{name} goes with a trajectory, not with arrays")
-        arrays, runs, steps = (read_arrays_of(source), (), ()) if binary else read_csv(source)
-        found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
-        told = (advice(found),) if found.quantity == "NIS" and found.names else ()
-        return described(found, run_names=runs, notes=(*found.notes, *told))
-    if nis:
+    if source.suffix in ARRAYS or (source.is_file() and _is_table(source, beside)):
+        if given := [name for name, value in beside.items() if value is not None]:
+            raise ValueError(f"{source}: --{given[0]} goes with a trajectory, not with arrays")
+        found = _of_arrays(source, stated, how, nis)
+    elif nis:
         raise ValueError(f"{source}: innovations must be in an npz or CSV file")
-    runs = runs_of(source, covariance, truth, estimate)
-    return evaluate_runs(source, runs, stated, how, time_offset, against=against is not None)
+    else:
+        runs = runs_of(source, covariance, truth, estimate)
+        found = evaluate_runs(source, runs, stated, how, time_offset, against=against is not None)
+    if innovations is None:
+        return found
+    of_innovations = evaluate_log(innovations, nis=True)
+    told = f"{of_innovations.headline.partition(':')[0]} (of innovations)"
+    return described(found, notes=(*found.notes, f"{told}; {advice(of_innovations, found)}"))
+
+
+def _of_arrays(source: Path, stated: dict[str, str], how: PoseOptions, nis: bool) -> Evaluation:
+    read = (read_arrays_of(source), (), ()) if source.suffix in ARRAYS else read_csv(source)
+    arrays, runs, steps = read
+    found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
+    told = (advice(found),) if found.quantity == "NIS" and found.names else ()
+    return described(found, run_names=runs, notes=(*found.notes, *told))
 
 
 def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
@@ -298,9 +297,7 @@ def evaluate_runs(
         found = described(found, time_offset=late)
     elif time_offset == "auto":
         found = described(found, time_offset=_all_runs(read))
-    told += (
-        *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
-    )  # fmt: skip
+    told += (*_remarks(read), *_other_times(read, longest))
     if not read[0].logs.covariances.said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
     return described(found, notes=(*found.notes, *told), run_names=names)

@@ -180,6 +180,10 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     if unused := len(text.times) - len(np.unique(of)):
         left_out["covariances are at no time of the estimate"] = unused, len(text.times)
     those = evaluated_poses(logs.files.estimate.parent, times, exactly_known(P))
+    for what, others in those.others.items():
+        left_out |= _counted(what, others)
+    if any(others.any() for others in those.others.values()):
+        notes.append(f"map {those.map}, the longest, is evaluated")
     result = RunLog(logs, times, estimates, P, true, those, left_out, (*notes, *more))
     _check_share(result, more)
     return result
@@ -275,18 +279,16 @@ def _counted(what: str, missing: Bool[np.ndarray, " n"]) -> dict[str, tuple[int,
 
 def _other_frames(log: Log, truth: Log) -> list[str]:
     """That the logs say that they are of different frames."""
-    notes = []
-    if log.body and truth.body and log.body != truth.body:
-        notes.append(
-            f"the estimate is of {log.body} and the truth of {truth.body}: what is between counts "
-            "as error"
-        )
-    if log.world and truth.world and log.world != truth.world:
-        notes.append(
-            f"the estimate is in {log.world} and the truth in {truth.world}: if these are "
-            "different worlds, align them (--align yaw or se3)"
-        )
-    return notes
+    align = "if these are different worlds, align them (--align yaw or se3)"
+    frames = (
+        ("of", log.body, truth.body, "what is between counts as error"),
+        ("in", log.world, truth.world, align),
+    )
+    return [
+        f"the estimate is {where} {own} and the truth {where} {true}: {told}"
+        for where, own, true, told in frames
+        if own and true and own != true
+    ]
 
 
 def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:

@@ -38,16 +38,14 @@ from jaxslam.evaluation.inputs import (
     Poses,
     checked_poses,
     filled,
-    sigmas,
     squared,
     step_times,
     whitened,
     without_known,
 )
-from jaxslam.evaluation.result import Evaluation, described
+from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
-from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
-from jaxslam.geometry import Geometry
+from jaxslam.evaluation.scale import at_one_scale, of_aligned
 from jaxslam.statistics.bands import Mask, PerAxis
 
 BEYOND = (
@@ -56,27 +54,12 @@ BEYOND = (
 )
 
 
-class _Options(NamedTuple):
-    """The options by which poses are compared, beside their convention."""
+class _Compared(NamedTuple):
+    """Poses along the axes used, of all steps that are not known by definition."""
 
-    align: str
-    used: tuple[str, ...]
-    """The names of the axes."""
-    truth_sigma: tuple[float, float] | None
-
-
-class _PoseErrors(NamedTuple):
-    """The errors that are evaluated: of all steps whose poses are not known by definition."""
-
-    errors: Float[np.ndarray, "runs steps m"]
+    found: Evaluation
+    errors: PerAxis
     covariances: Float[np.ndarray, "runs steps m m"]
-    whitened: PerAxis
-    start: int
-    logged: Mask
-    fitted: float
-    axis_fitted: Float[np.ndarray, " m"]
-    scale: Scale | None
-    notes: tuple[str, ...]
 
 
 def evaluate_poses(
@@ -115,7 +98,7 @@ def evaluate_poses(
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
     found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
-    identified = _identified(poses, stated, _Options(align, found.names, sigma))
+    identified = _identified(poses, stated, align, found.names, sigma)
     at = at[len(at) - found.steps :]
 
     def compared(poses: Poses, align: str, axes: Sequence[str]) -> Evaluation:
@@ -141,30 +124,18 @@ def as_stated(
     told: tuple[str, ...] = ()
     if not used:
         used, told = estimated(poses, stated, align)
-    found = _compared(poses, stated, _Options(align, used, truth_sigma))
-    return Evaluation(
-        quantity="NEES",
-        dof=len(used),
-        nees=filled(squared(found.whitened), found.logged, np.nan),
-        whitened=filled(found.whitened, found.logged, np.nan),
-        errors=filled(found.errors, found.logged, np.nan),
-        sigmas=filled(sigmas(found.covariances), found.logged, np.nan),
-        times=step_times(None, poses.estimates.shape[1])[found.start :],
-        timed=False,
-        names=used,
-        convention=stated,
-        alignment=align,
-        notes=(*told, *found.notes),
-        fitted=found.fitted,
-        axis_fitted=tuple(float(x) for x in found.axis_fitted),
-        scale=found.scale,
-        truth_sigma=truth_sigma,
-    )
+    found = _compared(poses, stated, align, used, truth_sigma).found
+    return described(found, notes=(*told, *found.notes))
 
 
-def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseErrors:
+def _compared(
+    poses: Poses,
+    convention: Convention,
+    align: str,
+    used: tuple[str, ...],
+    truth_sigma: tuple[float, float] | None,
+) -> _Compared:
     """The errors and covariances along the axes used, aligned, at one scale where it is free."""
-    align, used, truth_sigma = options
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
     world = aligned(poses, convention, align, axes)
@@ -185,9 +156,23 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
         notes += (BEYOND,)
     elif align == "sim3":
         scale = of_aligned(later, convention, axes, world.log_scale)
-    return _PoseErrors(
-        errors, P, whitened(errors, P), start, later.logged, fitted, axis_fitted, scale, notes
+    found = of_steps(
+        errors,
+        P,
+        later.logged,
+        quantity="NEES",
+        times=step_times(None, poses.estimates.shape[1])[start:],
+        timed=False,
+        names=used,
+        convention=convention,
+        alignment=align,
+        notes=notes,
+        fitted=fitted,
+        axis_fitted=tuple(float(x) for x in axis_fitted),
+        scale=scale,
+        truth_sigma=truth_sigma,
     )
+    return _Compared(found, errors, P)
 
 
 def _along(P: Values, axes: Axes) -> Values:
@@ -218,26 +203,31 @@ def _with_truth(
     return with_truth(later, convention, truth_sigma, np.exp(log_scale), firsts)
 
 
-def _identified(poses: Poses, stated: Convention, options: _Options) -> Identification:
+def _identified(
+    poses: Poses,
+    stated: Convention,
+    align: str,
+    used: tuple[str, ...],
+    truth_sigma: tuple[float, float] | None,
+) -> Identification:
     """Identify the convention among those of the same scale; else among those given the scale."""
-    geometry, used, poses = geometry_of(poses.estimates), options.used, poses.some()
+    geometry, poses = geometry_of(poses.estimates), poses.some()
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                found = _compared(poses, convention, options)
-                one = _tried(convention, geometry, found, used)
-                result[convention] = one._replace(
-                    log_determinant=one.log_determinant - _log_volume(convention, poses)
-                )
+                names = tuple(name for name in convention.names(geometry) if name in used)
+                one = _tried(_compared(poses, convention, align, names, truth_sigma))
+                volume = _log_volume(convention, poses)
+                result[convention] = one._replace(log_determinant=one.log_determinant - volume)
         return result
 
     # With one axis of rotation mixed and rpy are world, as in the plane.
     flat = sum(name.startswith("r") for name in used) < 2
     turned = stated.axes if stated.axes != "body" else "world"
     same = [c for c in alternatives(stated, geometry) if not flat or c.axes in ("body", turned)]
-    if stated.scale == "given" or options.align != "none":
+    if stated.scale == "given" or align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
@@ -252,21 +242,18 @@ def _log_volume(convention: Convention, poses: Poses) -> float:
     return 2 * float(volume.mean())
 
 
-def _tried(
-    convention: Convention, geometry: Geometry, found: _PoseErrors, used: tuple[str, ...]
-) -> Tried:
+def _tried(compared: _Compared) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
-    names = [name for name in convention.names(geometry) if name in used]
-    turns = np.array([name.startswith("r") for name in names])
+    found, P = compared.found, compared.covariances
+    turns = np.array([name.startswith("r") for name in found.names])
 
     def of(block: np.ndarray) -> np.ndarray:
-        e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
-        return filled(squared(whitened(e, P)), found.logged, np.nan)
+        z = whitened(compared.errors[..., block], P[..., block, :][..., block])
+        return filled(squared(z), found.logged, np.nan)
 
-    nees = filled(squared(found.whitened), found.logged, np.nan)
-    log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
+    log_determinant = float(np.linalg.slogdet(P[found.logged])[1].mean())
     parts = (of(block) if block.any() else None for block in (~turns, turns))
-    return Tried(nees, len(names), found.fitted, log_determinant, *parts, int(turns.sum()))
+    return Tried(found.nees, found.dof, found.fitted, log_determinant, *parts, int(turns.sum()))
 
 
 def axes_named(

@@ -572,20 +572,29 @@ def evaluate(
         nis = squared(whitened(e, P))
         return evaluate_nees(np.where(logged, nis, np.nan), dof, times=times, quantity="NIS")
     start, logged, notes = without_known(e, P, logged)
-    seconds = step_times(times, e.shape[1])
-    e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
-    z = whitened(e, filled(P, logged, np.eye(e.shape[-1])))
-    return Evaluation(
+    P = filled(P[:, start:], logged[:, start:], np.eye(e.shape[-1]))
+    return of_steps(
+        e[:, start:],
+        P,
+        logged[:, start:],
         quantity=quantity,
-        dof=e.shape[-1],
-        nees=filled(squared(z), logged, np.nan),
-        errors=filled(e, logged, np.nan),
-        sigmas=filled(sigmas(P), logged, np.nan),
-        times=seconds[start:],
+        times=step_times(times, e.shape[1])[start:],
         timed=times is not None,
         names=_names(names, e.shape[-1]),
         notes=notes,
+    )
+
+
+def of_steps(errors: PerAxis, P: Values, logged: Mask, **words: Any) -> Evaluation:
+    """The evaluation of errors and their covariances at the steps that were logged."""
+    z = whitened(errors, P)
+    return Evaluation(
+        dof=errors.shape[-1],
+        nees=filled(squared(z), logged, np.nan),
         whitened=filled(z, logged, np.nan),
+        errors=filled(errors, logged, np.nan),
+        sigmas=filled(sigmas(P), logged, np.nan),
+        **words,
     )
 
 

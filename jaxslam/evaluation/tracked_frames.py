@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,13 +29,13 @@ class FrameLog(NamedTuple):
 
 
 class EvaluatedPoses(NamedTuple):
-    """A mask of the poses of a run that have a part in the verdict, and counts of the others."""
+    """A mask of the poses of a run that have a part in the verdict, and of the others why not."""
 
     poses: Bool[np.ndarray, " n"]
-    map: int = 0
+    map: int
     """The map that is evaluated."""
-    others: tuple[int, int, int] = (0, 0, 0)
-    """The poses of other maps, those that are lost, and those from before the unit was fixed."""
+    others: Mapping[str, Bool[np.ndarray, " n"]]
+    """Masks of the poses of other maps, of lost frames, and from before the unit was fixed."""
 
 
 def evaluated_poses(
@@ -51,7 +51,7 @@ def evaluated_poses(
     path = folder / FRAMES
     frames = read_frames(path)
     if frames is None:
-        return EvaluatedPoses(np.ones(len(times), bool))
+        return EvaluatedPoses(np.ones(len(times), bool), 0, {})
     order = np.argsort(frames.times, kind="stable")
     place = np.interp(times, frames.times[order], np.arange(len(order)))
     nearest = order[np.rint(place).astype(int)]
@@ -68,7 +68,11 @@ def evaluated_poses(
     number = int(np.argmax(np.bincount(maps[usable])))
     own = maps == number
     opening = own & ~lost & ~fixed & ~known
-    others = int(np.sum(~own)), int(np.sum(own & lost)), int(np.sum(opening))
+    others = {
+        "poses are of other maps, each with its own unit": ~own,
+        "poses are of frames that are lost": own & lost,
+        "poses are from before the unit of their map was fixed": opening,
+    }
     return EvaluatedPoses(own & ~lost & ~opening, number, others)
 
 
@@ -93,18 +97,3 @@ def read_frames(path: Path) -> FrameLog | None:
     words = table.words.get(state, ("",) * len(rows))
     lost = np.array([word == "lost" for word in words])
     return FrameLog(rows[:, time], lost, rows[:, number].astype(int), rows[:, fixed] == 1)
-
-
-def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
-    """A sentence for every reason why poses of the runs are not evaluated."""
-    logged = sum(len(one.poses) for one in runs)
-    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "the longest map of each run"
-    reasons = (
-        (f"{which} is evaluated: ", "of other maps, each with its own unit"),
-        ("", "of frames that are lost"),
-        ("", "from before the unit of their map was fixed"),
-    )
-    counts = np.sum([one.others for one in runs], axis=0)
-    for (first, reason), count in zip(reasons, counts, strict=True):
-        if count:
-            yield f"{first}{count} of {logged} poses are {reason} and left out"

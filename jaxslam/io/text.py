@@ -8,7 +8,7 @@ nothing; a separator behind the last cell.
 import codecs
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,7 +81,11 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
     Raises `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a
     `row` of it is what is accepted.
     """
-    told = text_lines(path, what, comments=True)
+    return table_of(path, text_lines(path, what, comments=True), holds, row)
+
+
+def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
+    """The same of the lines of a file."""
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
     lines = {number: line for number, line in told.items() if not _is_comment(line)}
     named = []

@@ -758,7 +758,8 @@ def test_frames_that_the_tracker_says_nothing_of_the_unit_of_are_left_out(tmp_pa
     assert found.alignment == "sim3"
     told = str(found)
     assert "aligned at the first pose" in told
-    assert "map 0, the longest, is evaluated: 21 of 96 poses are of other maps" in told
+    assert "map 0, the longest, is evaluated" in told
+    assert "21 of 96 poses are of other maps" in told
     assert "5 of 96 poses are of frames that are lost" in told
     assert "9 of 96 poses are from before the unit of their map was fixed" in told
     (tmp_path / "frames.csv").unlink()
@@ -771,7 +772,8 @@ def test_a_later_map_that_is_the_longest_is_evaluated_in_its_own_unit(tmp_path):
     found = jaxslam.evaluate_log(tmp_path, align="sim3")
     expected = jaxslam.evaluate_poses(*(x[:, 11:] for x in arrays), TRACKED, align="sim3")
     np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-4)
-    assert "map 1, the longest, is evaluated: 11 of 51 poses" in str(found)
+    assert "map 1, the longest, is evaluated" in str(found)
+    assert "11 of 51 poses are of other maps" in str(found)
     with pytest.raises(ValueError, match=r"map is map 1, .*; use --align sim3"):
         jaxslam.evaluate_log(tmp_path)
 

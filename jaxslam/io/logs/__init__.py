@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jaxslam.io.logs import geodetic, graph, named, square, unnamed
 from jaxslam.io.logs.log import Log
-from jaxslam.io.text import read_table
+from jaxslam.io.text import table_of, text_lines
 
 FORMATS = (
     ("SQUARE of smfeval", square.read),
@@ -25,10 +25,11 @@ def read_log(path: str | Path) -> Log:
     """Read a trajectory of any known format. Raises ValueError, naming file and line, and for what
     is in no known format, which those are and what was found."""
     path = Path(path)
-    other = graph.read(path) or geodetic.read_novatel(path)
+    lines = text_lines(path, "trajectory", comments=True)
+    other = graph.read(path, lines) or geodetic.read_novatel(path, lines)
     if other is not None:
         return other
-    table = read_table(path, "trajectory", "poses", unnamed.EXPECTED)
+    table = table_of(path, lines, "poses", unnamed.EXPECTED)
     for _, read in FORMATS:
         found = read(table)
         if found is not None:

@@ -7,6 +7,7 @@ so that errors along the axes of its body are those: `split`, `body`. It has no 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
-from jaxslam.io.text import Table, numbers, text_lines
+from jaxslam.io.text import Table, numbers
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
@@ -58,16 +59,15 @@ def _week_or_date(table: Table, expected: str) -> Float[np.ndarray, " n"]:
     return np.array([date.replace(tzinfo=UTC).timestamp() for date in dates])
 
 
-def read_novatel(path: Path) -> Log | None:
+def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
     """Lines of UTC, week, its second, and degrees, minutes, seconds of latitude and longitude,
     under their titles; None of another file. Raises ValueError, naming the line."""
-    lines = text_lines(path, "trajectory")
-    title = next(iter(lines), None)
-    if title is None or not _NOVATEL.match(lines[title]):
+    title = next((number for number, line in lines.items() if _NOVATEL.match(line)), None)
+    if title is None:
         return None
     rows = []
-    for number, line in list(lines.items())[1:]:
-        if line.startswith("("):  # units
+    for number, line in lines.items():
+        if number <= title or line[0] in "(#%":  # units, and comments
             continue
         row = numbers(line.split()[:10], 10)
         if row is None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.io.logs.log import Log, log
-from jaxslam.io.text import Table, numbers, text_lines
+from jaxslam.io.text import Table, numbers
 from jaxslam.io.tum import of_xytheta
 
 _SPATIAL, _PLANAR = "VERTEX_SE3:QUAT", "VERTEX_SE2"
@@ -17,9 +18,8 @@ NOTE = (
 )
 
 
-def read(path: Path) -> Log | None:
+def read(path: Path, lines: Mapping[int, str]) -> Log | None:
     """The poses of a g2o file; None of another. Raises ValueError, naming the line."""
-    lines = text_lines(path, "trajectory")
     kinds = {line.split(maxsplit=1)[0] for line in lines.values()}
     kind = next((kind for kind in (_SPATIAL, _PLANAR) if kind in kinds), None)
     if kind is None:
