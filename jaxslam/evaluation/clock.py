@@ -46,10 +46,8 @@ def clock_offset(
 ) -> Offset | None:
     """The offset by least squares; None where rotations do not determine it.
 
-    Of a grid as fine as the truth the best one, refined between its neighbours.
+    Of a grid as fine as the truth the best one, refined by a parabola through its neighbours.
     """
-    from scipy.optimize import minimize_scalar  # slow to import
-
     (times, estimates), (true_times, truths) = (
         (t[~np.isnan(T[:, 0, 0])], T[~np.isnan(T[:, 0, 0])])
         for t, T in ((times, estimates), (true_times, truths))
@@ -78,8 +76,13 @@ def clock_offset(
     best = float(grid[int(np.argmin(costs))])
     if not np.isfinite(costs).any() or abs(best) >= FURTHEST - 2 * step:
         return None
-    near = (best - width, best + width)
-    best = float(minimize_scalar(cost, bounds=near, method="bounded", options={"xatol": 1e-6}).x)
+    for _ in range(6):
+        low, middle, high = (cost(best + x) for x in (-width, 0.0, width))
+        curvature = low - 2 * middle + high
+        if not np.isfinite(curvature) or curvature <= 0:  # flat, within what is rounded
+            break
+        best += float(np.clip((low - high) / (2 * curvature), -1, 1)) * width
+        width /= 2
     return Offset(best, _sigma(*(residuals(best + x) for x in (-step, 0.0, step)), 2 * step))
 
 
