@@ -9,7 +9,7 @@ onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -19,12 +19,14 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.evaluation.convention import (
     Axes,
     Convention,
+    Joints,
     Matrices,
     blocks,
     change,
     converted,
     geometry_of,
     lever,
+    transport,
 )
 from jaxslam.evaluation.inputs import MOST, Poses, exactly_known
 
@@ -295,14 +297,13 @@ def aligned(
     runs = range(len(poses.logged))
     places = runs, np.argmax(poses.logged, axis=1)
     known = exactly_known(poses.covariances[places][:, axes][:, :, axes]).all()
-    here = carried(poses, convention, _SPLIT)
+    here = _carried(poses, convention, _SPLIT)
     any_first = align == "first" and not known
-    small = not given and align != "sim3" and _small_at_first(here, align)
-    if known or any_first or small:
+    if known or any_first or (not given and align != "sim3" and _small_at_first(here, align)):
         truths = here.truths.copy()
         truths[..., :-1, -1] -= here.truths[places][:, None, :-1, -1]
-        joint = None if any_first else here.joint
         here = here._replace(truths=np.where(here.logged[..., None, None], truths, here.truths))
+        joint = None if any_first else here.joint
         lay = _by_any_first if any_first else partial(_by_first, yaw=align == "yaw")
         notes = (BY_ANY if any_first else BY_FIRST if known else BY_SMALL,)
         given |= align == "sim3"
@@ -315,30 +316,42 @@ def aligned(
         notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
         if align != "yaw" and any(_line(run) is not None for run in _runs(here)):
             notes += (STRAIGHT,)
-    T, log_scale = here.estimates.copy(), np.zeros(len(runs))
-    for i, run in enumerate(_runs(here)):
-        motion, P = lay(run)
-        B, there = motion.block, here.logged[i]
-        T[i, there], here.covariances[i, there] = motion.moved(run.estimates), B @ P @ B.T
+    moved, log_scale = _laid(here, lay, joint)
+    return Aligned(_carried(moved, _SPLIT, convention), given, notes, log_scale)
+
+
+def _laid(
+    poses: Poses,
+    lay: Callable[[Poses], tuple[Similarity, np.ndarray]],
+    joint: Joints | None,
+) -> tuple[Poses, Float[np.ndarray, " runs"]]:
+    """Every run in the world of its truth, and the log of its unit; errors are split."""
+    T, P, log_scale = poses.estimates.copy(), poses.covariances, np.zeros(len(poses.logged))
+    B = np.tile(np.eye(P.shape[-1]), (*P.shape[:2], 1, 1)) if joint is not None else None
+    for i, run in enumerate(_runs(poses)):
+        motion, own = lay(run)
+        block, there = motion.block, poses.logged[i]
+        transport(own, lambda _, block=block: block)
+        T[i, there], P[i, there] = motion.moved(run.estimates), own
         log_scale[i] = -np.log(motion.scale)
-        if joint is not None:
-            blocks_of = joint[i].reshape(len(there), len(B), len(there), len(B))
-            joint[i] = np.einsum("ab,kblc,dc->kald", B, blocks_of, B, optimize=True).reshape(
-                joint[i].shape
-            )
-    moved = here._replace(estimates=T, joint=joint)
-    return Aligned(carried(moved, _SPLIT, convention), given, notes, log_scale)
+        if B is not None:
+            B[i] = block
+    joint = None if joint is None or B is None else _joint(joint, B)
+    return poses._replace(estimates=T, joint=joint), log_scale
 
 
-def carried(poses: Poses, old: Convention, new: Convention) -> Poses:
+def _carried(poses: Poses, old: Convention, new: Convention) -> Poses:
     """The same poses, with covariances of errors of another convention."""
-    P = converted(poses.covariances, poses.estimates, old, new)
-    if poses.joint is None:
-        return poses._replace(covariances=P)
-    J = change(poses.estimates, old, new)
-    of_blocks = poses.joint.reshape(*J.shape[:3], *J.shape[1:3])
-    joint = np.einsum("rkab,rkblc,rldc->rkald", J, of_blocks, J, optimize=True)
-    return poses._replace(covariances=P, joint=joint.reshape(poses.joint.shape))
+    P, joint = converted(poses.covariances, poses.estimates, old, new), poses.joint
+    if joint is not None:
+        joint = _joint(joint, change(poses.estimates, old, new))
+    return poses._replace(covariances=P, joint=joint)
+
+
+def _joint(P: Joints, J: Float[np.ndarray, "runs steps t t"]) -> Joints:
+    """`J P Jᵀ` of joint covariances."""
+    of_blocks = P.reshape(*J.shape[:3], *J.shape[1:3])
+    return np.einsum("rkab,rkblc,rldc->rkald", J, of_blocks, J, optimize=True).reshape(P.shape)
 
 
 def _runs(poses: Poses) -> Iterator[Poses]:

@@ -367,9 +367,10 @@ def _half_angles(case: _Case) -> Mistake | None:
         if not own or (low or 0.0) > 1.05 * factor or (high or np.inf) < 0.95 * factor:
             return None
         off[factor].append(np.log(own / factor))
-    # Of one axis the factor scatters; an interval may be of any width.
-    if any(abs(np.mean(part)) > np.log(HALF) for part in off.values() if part):
-        return None
+    # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
+    for part in filter(None, off.values()):
+        if abs(np.mean(part)) > np.log(HALF) or np.ptp(part) > 3 * np.log(HALF):
+            return None
     names: Sequence[str] = case.convention.names(geometry_of(case.poses.estimates))
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in names])
     P = scale[:, None] * case.poses.covariances * scale

@@ -180,12 +180,16 @@ def converted(
     new: Convention,
 ) -> Float[np.ndarray, "*batch t t"]:
     """Convert covariances of poses from one convention to another."""
-    T, P = (x.reshape(-1, *x.shape[-2:]) for x in (poses, covariances))
-    result = np.empty(P.shape)
-    for part in blocks(len(T)):
-        J = change(T[part], old, new)
-        result[part] = J @ P[part] @ np.swapaxes(J, -1, -2)
-    return result.reshape(covariances.shape)
+    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64)
+    transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
+    return P
+
+
+def transport(P: Float[np.ndarray, "k t t"], derivative: Callable[[slice], Squares]) -> None:
+    """Replace every P by `J P Jᵀ`, with the J of a part of them at once."""
+    for part in blocks(len(P)):
+        J = derivative(part)
+        P[part] = J @ P[part] @ np.swapaxes(J, -1, -2)
 
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:

@@ -188,7 +188,17 @@ def turned_at_first(seed):
     return T, P, start @ turn @ np.linalg.inv(start) @ true
 
 
+def wrong_heading(seed):
+    """σ of the heading is too small by three, of roll and pitch by 1.2."""
+    T, rng = paths(seed), np.random.default_rng(seed)
+    white = rng.normal(size=(STEPS + 1, RUNS, 6))
+    errors = SIGMA * [1, 1, 1, 1.2, 1.2, 3] * np.swapaxes(correlated(white, 0.9)[:-1], 0, 1)
+    P = np.broadcast_to(np.diag(SIGMA**2), (RUNS, STEPS, 6, 6))
+    return T, P, displaced(T, errors, SPLIT)
+
+
 WRONG = {
+    "the heading": wrong_heading,
     **{f"σ, {x}": partial(right, x) for x in (1.3, 2.0, 3.0)},
     **{f"σ, {x}, of a level robot": partial(right, x, tilt=0.0) for x in (1.3, 3.0)},
     "drift": drifting,

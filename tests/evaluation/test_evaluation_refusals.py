@@ -304,7 +304,7 @@ OF_FOLDERS = [
     (
         shown(lambda t: f"{(t - 1.4e9) * 1e5:.0f}"),  # a hundred a second, in microseconds
         r"times 1e.04 from one to the next look like microseconds or milliseconds; expected "
-        r"seconds; a title such as `t \[us\]` says which",
+        "seconds; a title such as t_us says which",
     ),
     (shown(lambda t: f"{t * 1e8:.0f}"), r"1\.4e.17 look like nanoseconds; expected seconds"),
     (

@@ -38,6 +38,23 @@ def test_a_truth_at_other_stamps_is_interpolated(true, tmp_path):
     )
 
 
+def test_a_title_says_the_unit_of_times_that_may_be_two(tmp_path):
+    """From 0, a hundred a second: microseconds, or milliseconds."""
+    files(tmp_path)
+    for name, titles in (
+        ("estimate", "t_us,x,y,z,qx,qy,qz,qw"), ("truth", "timestamp [us],x,y,z,qx,qy,qz,qw"),
+        ("covariance", "t_us" + 21 * " c"),
+    ):  # fmt: skip
+        rows = np.loadtxt(tmp_path / f"{name}.txt")
+        rows[:, 0] *= 1e5
+        head = f"# {titles}\n# {LOG.convention}\n"
+        cells = "\n".join(",".join(f"{x:.12g}" for x in row) for row in rows)
+        (tmp_path / f"{name}.txt").write_text(head + cells + "\n")
+    found = evaluate_log(tmp_path)
+    there = found.logged[0]
+    np.testing.assert_allclose(found.nees[0, there], WANTED[0][-found.steps :][there], rtol=1e-3)
+
+
 def test_a_truth_that_is_too_rare_to_be_interpolated_is_refused_with_the_reason(tmp_path):
     """At 14 Hz, of an accurate estimate at 10 Hz: few stamps meet."""
     files(tmp_path, slice(0, None, 7))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -78,14 +79,15 @@ def log(
 def in_seconds(
     table: Table, times: Float[np.ndarray, " n"], unit: str = ""
 ) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
-    """Times in seconds, of the `unit` that is said, or the only one where they are `STEPS` apart.
+    """Times in seconds, of the `unit` that is said, there or by the title of a first column; or of
+    the only one in which they are `STEPS` apart.
 
     Raises ValueError, naming the line, for a time that is none.
     """
     wrong = np.flatnonzero(~np.isfinite(times))
     if wrong.size:
         raise ValueError(f"{table.place(wrong[0])}: expected a finite time")
-    if unit:
+    if unit := unit or unit_in("".join(table.titles[:1])):
         return times * UNITS[unit], ()
     try:
         check_seconds(str(table.path), times)
@@ -95,6 +97,12 @@ def in_seconds(
             raise
         return times * UNITS[unit], (f"{table.path}: times are taken as {unit}",)
     return times, ()
+
+
+def unit_in(title: str) -> str:
+    """The unit that a title says, as `t [us]` or `time_us`; "" where it says none."""
+    found = re.search(r"\[([num]?s)\]|_([num]?s)$", title.lower())
+    return found[found.lastindex or 0] if found else ""
 
 
 def unit_of(times: Float[np.ndarray, " n"]) -> str | None:
@@ -125,7 +133,7 @@ def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
         told = f"up to {last:.3g}"
         sizes = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
         units = [next(unit for least, unit in sizes if last >= least)]
-    ask = "; a title such as `t [us]` says which" if len(units) > 1 else ""
+    ask = "; a title such as t_us says which" if len(units) > 1 else ""
     raise ValueError(f"{what}: times {told} look like {' or '.join(units)}; expected seconds{ask}")
 
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric
+from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric, unit_in
 from jaxslam.io.text import Table
 from jaxslam.io.tum import of_xytheta
 
@@ -18,7 +18,7 @@ _TURN = (
 )
 _MEANINGS = {
     "time": re.compile(
-        r"t|(?:field\.)?(?:header\.)?(?:time_?stamps?|stamp|time|secs?|seconds)(_?s)?"
+        r"(?:t|(?:field\.)?(?:header\.)?(?:time_?stamps?|stamp|time|secs?|seconds))(?:_?[num]?s)?"
     ),
     "position": re.compile(rf"{_BEFORE}(?:t|p|p_rs_r)?[._ ]?([xyz])(?:_m)?"),
     "turn": re.compile(rf"{_TURN}([xyzw])"),
@@ -41,8 +41,7 @@ def read(table: Table) -> Log | None:
     if not {"t", "x", "y"} <= named.keys() or not (named.keys() & {"z", "θ"}):
         return None
     time = named["t"]
-    unit = re.search(r"\[(?:ns|us|ms|s)\]|_(?:ns|us|ms)$", table.titles[time])
-    unit = unit[0].strip("[]_") if unit else ""
+    unit = unit_in(table.titles[time])
     expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
     times = table.numbers(expected, [time])[:, 0]
     if "z" not in named:
