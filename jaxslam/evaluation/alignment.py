@@ -102,6 +102,14 @@ def nearest_rotation(M: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return left * signs @ right
 
 
+def angles(
+    R: Float[np.ndarray, "*k n n"], others: Float[np.ndarray, "*other n n"]
+) -> Float[np.ndarray, "*k"]:
+    """The angles between rotations."""
+    chord = np.linalg.norm(R - others, axis=(-2, -1)) / np.sqrt(2)
+    return np.asarray(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
+
+
 def similarity(
     estimate: Float[np.ndarray, "k n"],
     reference: Float[np.ndarray, "k n"],

@@ -14,7 +14,13 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
 
-from jaxslam.evaluation.alignment import aligned, gauge_directions, nearest_rotation, similarity
+from jaxslam.evaluation.alignment import (
+    aligned,
+    angles,
+    gauge_directions,
+    nearest_rotation,
+    similarity,
+)
 from jaxslam.evaluation.clock import increments
 from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
 from jaxslam.evaluation.inputs import Poses
@@ -96,12 +102,6 @@ def _nees(found: Evaluation) -> float:
     return float(np.mean(found.nees[found.logged]))
 
 
-def _angles(R: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k"]:
-    n = R.shape[-1]
-    chord = np.linalg.norm(R - np.eye(n), axis=(-2, -1)) / np.sqrt(2)
-    return np.asarray(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
-
-
 def _mean_rotation(R: Float[np.ndarray, "k n n"]) -> Float[np.ndarray, "n n"]:
     """The rotation nearest to their mean."""
     return nearest_rotation(R.mean(axis=0))
@@ -140,7 +140,7 @@ def _w_first(case: _Case) -> Mistake | None:
     def off(T: Matrices, true: Matrices) -> float:
         turn = np.swapaxes(T[there][:, :3, :3], 1, 2) @ true[there][:, :3, :3]
         # Up to a constant, as of another world or body.
-        return float(np.median(_angles(turn @ _mean_rotation(turn).T)))
+        return float(np.median(angles(turn, _mean_rotation(turn))))
 
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
@@ -202,7 +202,7 @@ def _apart(p: Float[np.ndarray, "k n"], true: Float[np.ndarray, "k n"]) -> list[
     moved = (x.scale * p @ x.rotation.T + x.translation for x in fits)
     R, first = fits[0].rotation, float(np.linalg.norm(p[0] - true[0]))
     tilt = float(np.arccos(np.clip(R[-1, -1], -1, 1)))
-    return [*(_rms(x - true) for x in (p, *moved)), first, float(_angles(R)), tilt]
+    return [*(_rms(x - true) for x in (p, *moved)), first, float(angles(R, np.eye(len(R)))), tilt]
 
 
 def _tilt(case: _Case) -> Mistake | None:
@@ -233,7 +233,7 @@ def _mounting(case: _Case) -> Mistake | None:
     if best is case.found:
         return None
     n, moved = len(X) - 1, _unmounted(case.poses, X)
-    angle, metres = float(_angles(X[:n, :n])), float(np.linalg.norm(X[:n, n]))
+    angle, metres = float(angles(X[:n, :n], np.eye(n))), float(np.linalg.norm(X[:n, n]))
     if not _of_body(case, best, angle) and not (_right(best) and _in_all_runs(X, case, moved)):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
@@ -327,7 +327,7 @@ def _of_body(case: _Case, fixed: Evaluation, angle: float) -> bool:
     n = poses.estimates.shape[-1] - 1
     R = poses.estimates[:, :, :n, :n][poses.logged]
     axis = poses.truths[:, :, :n, :n][poses.logged] @ np.swapaxes(R, 1, 2)
-    constant = _angles(axis @ _mean_rotation(axis).T)
+    constant = angles(axis, _mean_rotation(axis))
     in_world = turns.any() and _rms(constant) < 0.5 * angle
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
     explained = (ratio > LESS) & (ratio > LESS * left)

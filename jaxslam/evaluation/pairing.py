@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
@@ -367,8 +367,8 @@ def _interpolation_error(
     if not there.any():
         return np.full(2, np.inf)
     off = np.linalg.norm((between - true)[there, :n, n], axis=1)
-    chord = np.linalg.norm((between - true)[there, :n, :n], axis=(1, 2)) / np.sqrt(2)
-    return np.array([np.median(off), np.median(2 * np.arcsin(np.clip(chord / 2, 0, 1)))]) / 4
+    turned = angles(between[there, :n, :n], true[there, :n, :n])
+    return np.array([np.median(off), np.median(turned)]) / 4
 
 
 def _sigmas(log: Log, P: Float[np.ndarray, "n t t"], convention: Convention) -> np.ndarray:
