@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.source import Frame
+from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
@@ -66,10 +67,19 @@ class Tracked:
     and the map's is carried over by the landmarks' distances, about which no covariance knows."""
 
     @classmethod
-    def of(cls, frame: Frame, map: Map, observations: Observations = NOTHING, **found) -> Tracked:
+    def of(
+        cls,
+        frame: Frame,
+        map: Map,
+        observations: Observations = NOTHING,
+        correction: Correction | None = None,
+        **found,
+    ) -> Tracked:
         """Return what became of a frame, after which the map is this one; `found` are other
         fields."""
         place, doubt = map.place, map.place.sigma_log_scale
+        if correction is not None:
+            found |= {"nis": float(correction.nis), "nis_dof": int(correction.nis_dof)}
         return cls(
             frame.index,
             frame.time,

@@ -1,15 +1,18 @@
-"""The tracker: a filter fed with pictures, frame by frame, by active search."""
+"""The tracker: a filter fed with pictures, frame by frame, by active search.
+
+It is a fold: `step` takes a `TrackerState` and a frame to the next state.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.calibration import Calibration
@@ -19,19 +22,237 @@ from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
 from jaxslam.tracking.estimator import Correction, Estimator
-from jaxslam.tracking.landmarks import Landmark, Points
-from jaxslam.tracking.map import Map, in_view
+from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.map import Map, TrackerState, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.places.closing import close_loop
-from jaxslam.tracking.places.descriptors import note_looks
-from jaxslam.tracking.places.joining import LOOKED_EVERY, Join, join_of, joined, known_elsewhere
+from jaxslam.tracking.places.descriptors import with_looks
+from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.start import trackable, with_target
-from jaxslam.tracking.target import Target, TargetObservation
+from jaxslam.tracking.start import places_with_target, trackable
+from jaxslam.tracking.target import Target, TargetObservation, sighted
+
+Stepped = tuple[TrackerState, Tracked]
+"""The state after a frame, and what became of the frame."""
+
+
+def start(
+    slam: AbstractStaged, settings: TrackerSettings, calibration: Calibration
+) -> TrackerState:
+    """The state before the first frame of a camera with this calibration."""
+    with jax.enable_x64(True):
+        return TrackerState(calibration, Map(Estimator.of(slam, settings).empty()))
+
+
+def step(
+    slam: AbstractStaged,
+    settings: TrackerSettings,
+    state: TrackerState,
+    frame: Frame,
+    sighting: TargetObservation | None = None,
+) -> Stepped:
+    """Predict, search, update, and renew the map; the first frame may have a `sighting` of points
+    that are known.
+
+    A frame after which the camera's pose is not finite is lost: the tracker goes on from the state
+    before it. Raises ValueError for a frame of another size than the calibration's, or not later
+    than the one before.
+    """
+    check_size(f"frame {frame.index}", frame.image, state.calibration)
+    before = -np.inf if state.time is None else state.time
+    if not before < frame.time < np.inf:
+        raise ValueError(
+            f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
+            f"previous frame, {before} s"
+        )
+    with jax.enable_x64(True):
+        now = _Step(Estimator.of(slam, settings), frame)
+        try:
+            after, tracked = now.taken(state, sighting)
+        except (FloatingPointError, LinAlgError):
+            after, tracked = now.broken(state)
+    return replace(after, time=frame.time, steps=state.steps + 1), tracked
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a frame makes of a state."""
+
+    estimator: Estimator
+    frame: Frame
+
+    def taken(self, state: TrackerState, sighting: TargetObservation | None) -> Stepped:
+        """The frame, whatever is known."""
+        if state.searching:
+            return self._searching(state)
+        if state.time is None:
+            return self._first(state, sighting)
+        return self._next(state, self.frame.time - state.time)
+
+    def broken(self, state: TrackerState) -> Stepped:
+        """A frame that leads to numbers which are not finite: a new map where the camera was."""
+        state = replace(
+            _with_failure(state, "not_finite").remembered(), unmeasured=state.unmeasured + 1
+        )
+        try:
+            # Of a frame that may not have been the filter's first.
+            dt = np.asarray(0.0 if state.time is None else self.frame.time - state.time)
+            begun = state.given_up(self.estimator, sorted(state.landmarks))
+            return self._lost(begun.anew(self.estimator, dt), Lost.NOT_FINITE)
+        except (FloatingPointError, LinAlgError):
+            return state, Tracked.of(self.frame, state.map, reason=Lost.NOT_FINITE)
+
+    def _corners(self, occupied: np.ndarray | None = None) -> np.ndarray:
+        return bare_corners(self.frame.image, self.estimator.settings, occupied)
+
+    def _policy(self, state: TrackerState) -> Policy:
+        estimator = self.estimator
+        return Policy(state.calibration, estimator.settings, estimator.slam.ambiguous_start)
+
+    def _searching(self, state: TrackerState) -> Stepped:
+        """Look for a map that is known; begin another where there was none for long."""
+        found = known_again(self.frame.image, self.estimator, self._policy(state), state)
+        if found is not None:
+            return self._back(*found)
+        state, corners = replace(state, unmeasured=state.unmeasured + 1), self._corners()
+        waits = state.unmeasured <= self.estimator.settings.lost_for
+        if waits or len(corners) < LEAST_MATCHES:
+            return state, Tracked.of(self.frame, state.map, reason=Lost.NOTHING_EXPECTED)
+        state = replace(state, unmeasured=0, searching=False)
+        return self._begun(state, corners, starts=True)
+
+    def _first(self, state: TrackerState, sighting: TargetObservation | None) -> Stepped:
+        """Begin the first map with the first frame."""
+        self.estimator.compile(self._policy(state).in_wide)
+        pixels, depths = self._corners(), None
+        if sighting is not None:
+            pixels, depths = places_with_target(sighting, pixels, self.estimator.settings)
+        return self._begun(state, pixels, depths, starts=True)
+
+    def _begun(
+        self,
+        state: TrackerState,
+        pixels: np.ndarray,
+        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        **found: Any,
+    ) -> Stepped:
+        """Begin a map with landmarks at these pixels."""
+        state = state.begun(self.estimator, self.frame.image, pixels, depths)
+        return state, Tracked.of(self.frame, state.map, created=pixels, **found)
+
+    def _next(self, state: TrackerState, seconds: float) -> Stepped:
+        """Track a frame so many seconds after the one before."""
+        frame, estimator, policy = self.frame, self.estimator, self._policy(state)
+        predicted = estimator.predict(state.map.state, seconds)
+        ahead, behind = predicted.view.sides
+        if behind > ahead and behind >= LEAST_MATCHES:
+            # Nobody is to come back to it.
+            state = replace(state, reversed=state.reversed + 1, seen=None)
+            return self._lost(state.coasted(estimator, predicted), Lost.REVERSED)
+        lost, doubtful = state.unmeasured > 0, state.doubtful
+        seen, reason, doubtful = policy.observed(
+            frame.image, state.map, estimator, predicted, lost=lost, doubtful=doubtful
+        )
+        # Of two motions that contradict each other a place that is known says no more: it is one of
+        # both.
+        elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
+        state = replace(state, doubtful=doubtful, elsewhere=elsewhere and reason is not None)
+        if reason is not None:
+            state = state.remembered()
+        if state.elsewhere and lost:
+            found = known_again(frame.image, estimator, policy, state)
+            if found is not None:
+                return self._back(*found)
+        seen = state.map.weighed(seen, estimator.settings)
+        belief, correction = estimator.correct(predicted, seen)
+        if correction.failed:
+            state = _with_failure(state, Status(int(correction.status)).name.lower())
+            fallen = state.remembered().fallen_back(estimator, predicted)
+            return self._lost(fallen, Lost.NOT_POSITIVE)
+        seen = seen.but_for(correction.used)
+        last = state.map.place.camera.T_wc
+        state = state.with_map(state=belief).noted(estimator, seen, predicted)
+        if reason is None:
+            state = replace(state, seen=None)
+        if reason is None and not seen.matched.any():
+            reason = Lost.REFUSED
+        return self._corrected(state, last, seen, correction, reason)
+
+    def _corrected(
+        self,
+        state: TrackerState,
+        last: np.ndarray,
+        seen: Observations,
+        correction: Correction,
+        reason: Lost | None,
+    ) -> Stepped:
+        """Renew the map after an update, and look for places that are known; `last` is T of the
+        camera before."""
+        frame, estimator, settings = self.frame, self.estimator, self.estimator.settings
+        if reason is None:
+            measured = max(state.restarts, state.map.number)
+            state = replace(state, unmeasured=0, restarts=measured)
+        else:
+            state = replace(state, unmeasured=state.unmeasured + 1)
+        if not state.landmarks or state.unmeasured > settings.lost_for:
+            return self._lost(state, reason or Lost.NOTHING_EXPECTED, seen)
+        kept = in_view(state.landmarks, seen.slots, settings)
+        # What a lost camera sees may be another place: it is not put into this map.
+        created = np.zeros((0, 2)) if reason is not None else self._corners(seen.places[kept])
+        ended = len(state.map.submaps)
+        state = state.renewed(estimator, frame.image, created, seen.slots[kept])
+        if reason is None and state.steps % LOOKED_EVERY == 0:
+            found = known_elsewhere(frame.image, estimator, self._policy(state), state)
+            if found is not None:
+                return self._joined(last, *found)
+        loop = None
+        if len(state.map.submaps) > ended:
+            closed = close_loop(frame.image, estimator, state)
+            if closed is not None:
+                state, place = closed
+                state = replace(state, refused=state.refused + (not place.believed))
+                loop = place.submap if place.believed else None
+        if reason is None and state.steps % NOTED_EVERY == 0:
+            state = state.with_map(landmarks=with_looks(state.landmarks, frame.image))
+        return state, Tracked.of(
+            frame, state.map, seen, correction, created=created, reason=reason, loop=loop
+        )
+
+    def _joined(
+        self, last: np.ndarray, state: TrackerState, seen: Observations, correction: Correction
+    ) -> Stepped:
+        """Go on in another map, which this one is joined to."""
+        before = state.left[-1]
+        state, tracked = self._back(state, seen, correction)
+        join = join_of(self.estimator, before, state.map, state.steps, last)
+        return replace(state, joins=state.joins + (() if join is None else (join,))), tracked
+
+    def _back(self, state: TrackerState, seen: Observations, correction: Correction) -> Stepped:
+        """Go on in a map in which the camera was found again."""
+        estimator, nothing = self.estimator, np.zeros((0, 2))
+        state = state.noted(estimator, seen).renewed(estimator, self.frame.image, nothing)
+        state = state.with_map(state=estimator.at_rest(state.map.state))
+        state = replace(state, unmeasured=0, searching=False, doubtful=False)
+        return state, Tracked.of(self.frame, state.map, seen, correction, relocalised=True)
+
+    def _lost(self, state: TrackerState, reason: Lost, seen: Observations = NOTHING) -> Stepped:
+        """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
+        corners, number = self._corners(), state.map.number
+        state = state.renewed(self.estimator, self.frame.image, corners[:0])
+        if len(corners) < LEAST_MATCHES:
+            return state, Tracked.of(self.frame, state.map, seen, reason=reason)
+        state = replace(state.restarted(self.estimator), unmeasured=0, doubtful=False)
+        starts = state.map.number != number
+        return self._begun(state, corners, observations=seen, reason=reason, starts=starts)
+
+
+def _with_failure(state: TrackerState, name: str) -> TrackerState:
+    """One more update that failed so."""
+    return replace(state, failed={**state.failed, name: state.failed.get(name, 0) + 1})
 
 
 @dataclass
@@ -44,9 +265,9 @@ class Tracker:
     length is another, which no covariance here knows of. Within a map there is one unit, whatever
     the filter makes of the scale meanwhile (docs/gauge.md).
 
-    The mutable part is this object and its pieces; all mathematics is in pure, jitted functions of
-    the filter's state. Raises ValueError for a filter that cannot track, or cannot begin with the
-    target.
+    It holds the `state` that `jaxslam.tracking.tracker.step` goes on from, and what that knows it
+    has too: `steps`, `created`, `deleted`, `landmarks`, `restarts` and the others. Raises
+    ValueError for a filter that cannot track, or cannot begin with the target.
     """
 
     calibration: Calibration
@@ -61,28 +282,10 @@ class Tracker:
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
     """The name in the settings, or the class of your own filter."""
-    time: float | None = field(default=None, init=False)
-    """The time of the latest frame, s."""
-    steps: int = field(default=0, init=False)
-    """Frames given so far."""
-    unmeasured: int = field(default=0, init=False)
-    """The latest of them, in a row, in which no landmark was measured."""
-    elsewhere: bool = field(default=False, init=False)
-    """Whether the map was out of view in one of them."""
-    searching: bool = field(default=False, init=False)
-    """Whether no map has started because a known one may be found."""
-    failed: Counter[str] = field(default_factory=Counter, init=False)
-    """How many updates ended in which `Status` that says that their result means nothing."""
-    refused: int = field(default=0, init=False)
-    """Places that looked like earlier ones, and that cannot be these."""
-    reversed: int = field(default=0, init=False)
-    """Maps that turned out to lie behind the camera, and were given up."""
-    joins: tuple[Join, ...] = field(default=(), init=False)
-    """Maps that turned out to be of one world."""
-    map: Map = field(init=False, repr=False)
-    """Its landmarks and where it is in the world."""
-    policy: Policy = field(init=False, repr=False)
-    """Which matches are believed."""
+    estimator: Estimator = field(init=False, repr=False)
+    """The filter."""
+    state: TrackerState = field(init=False, repr=False)
+    """All that is known after the latest frame."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.calibration, Calibration):
@@ -94,44 +297,25 @@ class Tracker:
         self.filter_name = settings.filter if own is None else type(own).__name__
         made = settings.make_filter(self.calibration) if own is None else own
         made = trackable(self.filter_name, made, settings, self.target)
-        self.policy = Policy(self.calibration, settings, made.ambiguous_start)
-        with jax.enable_x64(True):
-            self.map = Map(settings, Estimator(made, settings))
+        self.state = start(made, settings, self.calibration)
+        self.estimator = Estimator.of(made, settings)
 
-    @property
-    def landmarks(self) -> dict[int, Landmark]:
-        """The landmarks in the map, by their slot of the filter's state."""
-        return self.map.landmarks
-
-    @property
-    def created(self) -> int:
-        """The number of landmarks so far."""
-        return self.map.created
-
-    @property
-    def deleted(self) -> int:
-        """The number of landmarks that were given up."""
-        return self.map.deleted
-
-    @property
-    def restarts(self) -> int:
-        """The number of maps initialised after the first."""
-        return self.map.latest
+    def __getattr__(self, name: str) -> Any:
+        """What the state says."""
+        if name == "state":  # not made yet
+            raise AttributeError(name)
+        return getattr(self.state, name)
 
     def track(self, frame: Frame) -> Tracked:
         """Predict, search, update, and renew the map. Raises ValueError, and changes nothing, for
         a frame of another size than the calibration's, or not later than the one before."""
-        check_size(f"frame {frame.index}", frame.image, self.calibration)
-        before = -np.inf if self.time is None else self.time
-        if not before < frame.time < np.inf:
-            raise ValueError(
-                f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
-                f"previous frame, {before} s"
+        sighting = None
+        if self.target is not None and self.state.time is None:
+            sighting = sighted(
+                self.target, frame.image, self.calibration, self.settings.pixel_sigma
             )
-        with jax.enable_x64(True):
-            tracked = self._first(frame) if self.time is None else self._next(frame, self.time)
-        self.time = frame.time
-        self.steps += 1
+        self.state, tracked = step(self.estimator.slam, self.settings, self.state, frame, sighting)
+        self.sighting = self.sighting if sighting is None else sighting
         return tracked
 
     def step(self, image: np.ndarray, time: float) -> Tracked:
@@ -141,35 +325,37 @@ class Tracker:
 
     def compile(self) -> None:
         """Compile all programs now; else the first frames wait for it, and a camera does not."""
+        policy = Policy(self.calibration, self.settings, self.estimator.slam.ambiguous_start)
         with jax.enable_x64(True):
-            for thread in self.map.estimator.compile(self.policy.in_wide):
+            for thread in self.estimator.compile(policy.in_wide):
                 thread.join()
 
     def points(self) -> Points:
         """Return all landmarks, those gone included."""
         with jax.enable_x64(True):
-            return self.map.points()
+            return self.state.points(self.estimator)
 
     def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
         """Return the frames so far, and all landmarks, as all that was seen later has them: loops
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
-            return joined(self.joins, *smoothed(self.map, history))
+            return joined(self.state.joins, *smoothed(self.estimator, self.state, history))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
         as far as this map tells; None for a filter without a pinhole camera."""
         with jax.enable_x64(True):
-            return self.map.estimator.camera()
+            return self.estimator.camera(self.state.map.state)
 
     def save(self, path: str | Path) -> None:
         """Write all that is needed to go on from here (.npz), whole or not at all.
 
         Raises ValueError before the first frame, when there is nothing to go on from.
         """
-        if self.time is None:
+        if self.state.time is None:
             raise ValueError("a tracker without any frame has nothing to save")
-        persistence.save(path, self, None if self.filter is None else self.filter_name)
+        own = None if self.filter is None else self.filter_name
+        persistence.save(path, self.state, self.settings, own)
 
     @classmethod
     def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
@@ -178,7 +364,10 @@ class Tracker:
         If it had a `filter` of your own, pass that again. Raises ValueError for a file
         that is none, or of another filter.
         """
-        return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
+        saved = persistence.read(path, own_filter=filter is not None)
+        tracker = cls(saved.calibration, saved.settings, filter)
+        tracker.state = saved.state(tracker.estimator)
+        return tracker
 
     @classmethod
     def localising(
@@ -195,130 +384,15 @@ class Tracker:
                 f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
             )
         with jax.enable_x64(True):
-            tracker.map.leave()
-        tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1
-        tracker.searching = True
-        tracker.joins = tuple(replace(one, step=-1) for one in tracker.joins)
-        tracker.policy.forget()
+            state = tracker.state.departed(tracker.estimator)
+        joins = tuple(replace(one, step=-1) for one in state.joins)
+        tracker.state = replace(
+            state,
+            joins=joins,
+            time=None,
+            steps=0,
+            unmeasured=1,
+            searching=True,
+            doubtful=False,
+        )
         return tracker
-
-    def _searching(self, frame: Frame) -> Tracked:
-        """Look for a map that is known; begin another where there was none for long."""
-        found = known_again(frame.image, self.map, self.policy)
-        if found is not None:
-            return self._back(frame, *found)
-        self.unmeasured += 1
-        corners = bare_corners(frame.image, self.settings)
-        if self.unmeasured <= self.settings.lost_for or len(corners) < LEAST_MATCHES:
-            return Tracked.of(frame, self.map, reason=Lost.NOTHING_EXPECTED)
-        self.map.begin(frame.image, corners)
-        self.unmeasured, self.searching = 0, False
-        return Tracked.of(frame, self.map, created=corners, starts=True)
-
-    def _first(self, frame: Frame) -> Tracked:
-        """Begin the first map with the first frame."""
-        self.map.estimator.compile(self.policy.in_wide)
-        if self.searching:
-            return self._searching(frame)
-        pixels, depths = bare_corners(frame.image, self.settings), None
-        if self.target is not None:
-            self.sighting, pixels, depths = with_target(
-                self.target, frame.image, pixels, self.calibration, self.settings
-            )
-        self.map.begin(frame.image, pixels, depths)
-        return Tracked.of(frame, self.map, created=pixels, starts=True)
-
-    def _next(self, frame: Frame, before: float) -> Tracked:
-        """Track a frame after one of the time `before`."""
-        if self.searching:
-            return self._searching(frame)
-        last = self.map.place.camera.T_wc
-        predicted = self.map.estimator.predict(frame.time - before)
-        ahead, behind = predicted.view.sides
-        if behind > ahead and behind >= LEAST_MATCHES:
-            self.reversed += 1
-            self.map.seen = None  # nobody is to come back to it
-            self.map.coast(predicted)
-            return self._lost(frame, Lost.REVERSED)
-        lost = self.unmeasured > 0
-        seen, reason = self.policy.observed(frame.image, self.map, predicted, lost=lost)
-        if reason is not None:
-            self.map.remember()
-        # Of two motions that contradict each other a place that is known says no more: it is one of
-        # both.
-        self.elsewhere |= reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
-        self.elsewhere &= reason is not None
-        if self.elsewhere and self.unmeasured:
-            found = known_again(frame.image, self.map, self.policy)
-            if found is not None:
-                return self._back(frame, *found)
-        seen = self.map.weighed(seen)
-        correction = self.map.estimator.correct(predicted, seen)
-        if correction.failed:
-            self.map.remember()
-            self.failed[Status(int(correction.status)).name.lower()] += 1
-            self.map.fall_back(predicted)
-            return self._lost(frame, Lost.NOT_POSITIVE)
-        seen = seen.but_for(correction.used)
-        self.map.note(seen, predicted)
-        if reason is None and not seen.matched.any():
-            reason = Lost.REFUSED
-        self.unmeasured = 0 if reason is None else self.unmeasured + 1
-        if reason is None:
-            self.map.seen = None
-        if not self.landmarks or self.unmeasured > self.settings.lost_for:
-            return self._lost(frame, reason or Lost.NOTHING_EXPECTED, seen)
-        kept = in_view(self.landmarks, seen.slots, self.settings)
-        # What a lost camera sees may be another place: it is not put into this map.
-        created = np.zeros((0, 2))
-        if reason is None:
-            created = bare_corners(frame.image, self.settings, seen.places[kept])
-        ended = len(self.map.submaps)
-        self.map.renew(frame.image, created, seen.slots[kept])
-        if reason is None and self.steps % LOOKED_EVERY == 0:
-            found = known_elsewhere(frame.image, self.map, self.policy, self.joins)
-            if found is not None:
-                return self._joined(frame, last, *found)
-        closed = None
-        if len(self.map.submaps) > ended:
-            closed = close_loop(frame.image, self.map, self.calibration)
-            self.refused += closed is not None and not closed.believed
-        if reason is None and self.steps % NOTED_EVERY == 0:
-            note_looks(self.landmarks.values(), frame.image)
-        nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        found = {"nis": nis, "nis_dof": nis_dof, "reason": reason}
-        if closed is not None and closed.believed:
-            found["loop"] = closed.submap
-        return Tracked.of(frame, self.map, seen, created=created, **found)
-
-    def _joined(
-        self, frame: Frame, last: np.ndarray, seen: Observations, correction: Correction
-    ) -> Tracked:
-        """Go on in another map, which this one is joined to; `last` is T of the camera before."""
-        before = self.map.left[-1]
-        tracked = self._back(frame, seen, correction)
-        join = join_of(before, self.map, self.steps, last)
-        self.joins += () if join is None else (join,)
-        return tracked
-
-    def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
-        """Go on in a map in which the camera was found again."""
-        self.map.note(seen)
-        self.map.renew(frame.image, np.zeros((0, 2)))
-        self.map.estimator.at_rest()
-        self.unmeasured, self.searching = 0, False
-        self.policy.forget()
-        nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        return Tracked.of(frame, self.map, seen, nis=nis, nis_dof=nis_dof, relocalised=True)
-
-    def _lost(self, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Tracked:
-        """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
-        corners = bare_corners(frame.image, self.settings)
-        self.map.renew(frame.image, corners[:0])
-        if len(corners) < LEAST_MATCHES:
-            return Tracked.of(frame, self.map, seen, reason=reason)
-        self.map.restart()
-        self.map.begin(frame.image, corners)
-        self.unmeasured = 0
-        self.policy.forget()
-        return Tracked.of(frame, self.map, seen, created=corners, reason=reason, starts=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -34,13 +35,16 @@ def describe(
     return descriptors, there
 
 
-def note_looks(landmarks: Iterable[Landmark], image: Picture) -> None:
-    """Note what landmarks look like in the latest picture, those that it shows."""
-    shown = [one for one in landmarks if not one.unseen]
-    pixels = np.array([one.seen_at for one in shown]).reshape(-1, 2)
-    for one, descriptor, there in zip(shown, *describe(image, pixels), strict=True):
+def with_looks(landmarks: Mapping[int, Landmark], image: Picture) -> Mapping[int, Landmark]:
+    """The landmarks with what they look like in the latest picture, those that it shows."""
+    shown = {slot: one for slot, one in landmarks.items() if not one.unseen}
+    pixels = np.array([one.seen_at for one in shown.values()]).reshape(-1, 2)
+    looking = dict(landmarks)
+    for (slot, one), descriptor, there in zip(shown.items(), *describe(image, pixels), strict=True):
         if there:
-            one.looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
+            looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
+            looking[slot] = replace(one, looks=looks)
+    return looking
 
 
 def described_corners(image: Picture) -> Corners:

@@ -13,22 +13,25 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.landmarks import Points
-from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint
 from jaxslam.tracking.report import Tracked
 
 
-def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+def smoothed(
+    estimator: Estimator, state: TrackerState, history: Sequence[Tracked]
+) -> tuple[list[Tracked], Points]:
     """Return the frames and landmarks as they are known now; those of maps with one submap, and of
     maps that no camera can come back to, stay as they are."""
-    before = map.points()
+    before = state.points(estimator)
     frames, points = list(history), before
     # What branches off is of two: the way from there on, and what led there as the latest has it.
-    for one in (*map.known()[::-1], map.now()):
+    for one in (*state.known()[::-1], state.map):
         if one.submaps:
-            graph = one.graph(map.settings, map.estimator.slam)
+            graph = one.graph(estimator.settings, estimator.slam)
             parts = _parts(one, graph, graph.solved())
             for i, camera in _cameras(parts, history).items():
                 frames[i] = replace(history[i], camera=camera)
@@ -85,7 +88,7 @@ def _part_of(T: Transform, share: float) -> Transform:
     return part
 
 
-def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
+def _parts(one: Map, graph: Graph, solved: Solved) -> list[_Part]:
     """All submaps of a map, the present one last."""
     place, unit = one.place, one.place.unit
     submaps = [*graph.submaps, graph.present]
