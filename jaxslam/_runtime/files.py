@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -41,6 +42,16 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
         if temporary.is_dir():
             shutil.rmtree(temporary)
         temporary.unlink(missing_ok=True)
+
+
+def append_whole(path: str | Path, text: str) -> None:
+    """Add text to a file, all of it or nothing. Raises OSError."""
+    data = text.encode()
+    with Path(path).open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(data) < len(data):  # a disk that is full
+            file.truncate(end)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def read_json(path: str | Path, what: str, parse: Callable[[Json], T]) -> T:

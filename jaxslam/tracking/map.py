@@ -89,6 +89,8 @@ class Map:
 class TrackerState:
     """All that a tracker knows after a frame, and goes on from."""
 
+    estimator: Estimator = field(compare=False, repr=False)
+    """The filter that takes it on, which is no part of it."""
     calibration: Calibration
     """That of the camera."""
     map: Map
@@ -102,6 +104,14 @@ class TrackerState:
     """Whether the map was out of view in one of them."""
     searching: bool = False
     """Whether no map has started because a known one may be found."""
+    image: Picture | None = None
+    """The latest picture that was used."""
+    apart: float = 0.0
+    """By how many grey levels, RMS, it is another than the one before it."""
+    repeats: int = 0
+    """How many that were the same have come since, in a row."""
+    waiting: float = 0.0
+    """The time that they took, s, which is the next picture's."""
     doubtful: bool = False
     """Whether two motions of the camera were as likely when there were matches last."""
     failed: Mapping[str, int] = field(default_factory=dict)
@@ -159,62 +169,58 @@ class TrackerState:
         """The state with another map: this one, but for these of its fields."""
         return replace(self, map=replace(self.map, **changes))
 
-    def points(self, estimator: Estimator) -> Points:
+    def points(self) -> Points:
         """Return all landmarks, those gone included."""
-        return joined([*self.finished, self._recorded(estimator, sorted(self.landmarks))])
+        return joined([*self.finished, self._recorded(sorted(self.landmarks))])
 
-    def noted(
-        self, estimator: Estimator, seen: Observations, predicted: Predicted | None = None
-    ) -> TrackerState:
+    def noted(self, seen: Observations, predicted: Predicted | None = None) -> TrackerState:
         """The state after what was found of the landmarks, where that was `predicted` by how much
         it is off, without those that are searched in vain."""
         landmarks, matched = dict(self.landmarks), seen.labelled("matched")
         if predicted is not None and len(matched.slots):
-            innovations = estimator.each_given_others(predicted, matched)
+            innovations = self.estimator.each_given_others(predicted, matched)
             for slot, innovation in zip(matched.slots.tolist(), innovations, strict=True):
                 landmarks[slot] = landmarks[slot].compared(innovation)
-        landmarks = note_found(landmarks, seen, estimator.settings)
-        failing_ones = failing(landmarks, estimator.settings)
-        return self.with_map(landmarks=landmarks).given_up(estimator, failing_ones)
+        landmarks = note_found(landmarks, seen, self.estimator.settings)
+        vain = failing(landmarks, self.estimator.settings)
+        return self.with_map(landmarks=landmarks).given_up(vain)
 
     def begun(
         self,
-        estimator: Estimator,
         image: Picture,
         pixels: Pixels,
         depths: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> TrackerState:
         """Landmarks at these pixels begin a map that has none; `depths` as `Estimator`'s."""
-        slots = self._free(estimator, len(pixels))
-        state, report = estimator.begin(self.map.state, slots, pixels, depths)
+        slots = self._free(len(pixels))
+        state, report = self.estimator.begin(self.map.state, slots, pixels, depths)
         begun = self.with_map(state=state, place=self.map.place.begun(report))
-        return begun._with_new(estimator, slots, image, pixels)
+        return begun._with_new(slots, image, pixels)
 
     def renewed(
         self,
-        estimator: Estimator,
         image: Picture,
         pixels: Pixels,
         kept: Int[np.ndarray, " n"] = NO_SLOTS,
     ) -> TrackerState:
         """The state at the end of the filter's frame, with new landmarks at these pixels, for which
         others than those in the slots `kept` make room."""
-        now = self._with_room(estimator, len(pixels), kept)
-        slots = now._free(estimator, len(pixels))
-        state, report = estimator.renew(now.map.state, slots, pixels)
+        now = self._with_room(len(pixels), kept)
+        slots = now._free(len(pixels))
+        state, report = self.estimator.renew(now.map.state, slots, pixels)
         now = now.with_map(state=state)
         if gone := [slot for slot in now.landmarks if not report.in_map[slot]]:
-            now = now.given_up(estimator, gone, now._nowhere(gone))
+            now = now.given_up(gone, now._nowhere(gone))
         found = [one.number for one in now.landmarks.values() if one.found]
-        place = now.map.place.followed(report, now._nearness(estimator), found)
-        now = now.with_map(place=place)._with_new(estimator, slots, image, pixels)
+        place = now.map.place.followed(report, now._nearness(), found)
+        now = now.with_map(place=place)._with_new(slots, image, pixels)
         more = place.unit_fixed and now.seen is None and len(now.map.submaps) < MOST
-        return now._handed_over(estimator, image) if report.left and more else now
+        return now._handed_over(image) if report.left and more else now
 
-    def _handed_over(self, estimator: Estimator, image: Picture) -> TrackerState:
+    def _handed_over(self, image: Picture) -> TrackerState:
         """The submap ends at the camera, where this picture was taken."""
         landmarks = with_looks(self.landmarks, image)
-        settings, slam, map = estimator.settings, estimator.slam, self.map
+        settings, slam, map = self.estimator.settings, self.estimator.slam, self.map
         numbers = slot_numbers(landmarks, settings.capacity)
         ended, state = handed_over(slam, map.state, numbers, map.place.camera, number=map.submap)
         number, submaps = self.latest_submap + 1, (*map.submaps, ended)
@@ -229,16 +235,16 @@ class TrackerState:
             charted={**self.charted, **{one.number: one for one in landmarks.values()}},
         )
 
-    def restarted(self, estimator: Estimator) -> TrackerState:
+    def restarted(self) -> TrackerState:
         """The state without landmarks: another map begins where the camera is. One that was never
         measured is none, and has its number."""
-        now = self.given_up(estimator, sorted(self.landmarks))._with_seen_kept()
+        now = self.given_up(sorted(self.landmarks))._with_seen_kept()
         place = now.map.place.restarted()
-        return now._begun_anew(estimator, place, number=now.restarts + 1)
+        return now._begun_anew(place, number=now.restarts + 1)
 
-    def departed(self, estimator: Estimator) -> TrackerState:
+    def departed(self) -> TrackerState:
         """The state without landmarks: what comes next is in another world, unless it is known."""
-        return self.remembered().restarted(estimator).with_map(place=MapInWorld())
+        return self.remembered().restarted().with_map(place=MapInWorld())
 
     def remembered(self) -> TrackerState:
         """The state in which the map is kept as it was in the frame before this one, in which the
@@ -249,7 +255,7 @@ class TrackerState:
             return replace(self, seen=map)
         return self
 
-    def come_back(self, estimator: Estimator, known: Map, found: Map) -> TrackerState:
+    def come_back(self, known: Map, found: Map) -> TrackerState:
         """Leave this map for one that was `known`, as it is now that it is `found`.
 
         Where that is an earlier submap, the next one is of another branch than what came after it,
@@ -257,7 +263,7 @@ class TrackerState:
         """
         now = self
         if known is not self.seen:
-            now = now.given_up(estimator, sorted(now.landmarks))._with_seen_kept()
+            now = now.given_up(sorted(now.landmarks))._with_seen_kept()
         left = tuple(one for one in now.left if one is not known)
         if not any(known is one for one in self.known()):
             number = now.latest_submap + 1
@@ -267,38 +273,36 @@ class TrackerState:
         finished = tuple(points.only(~np.isin(points.numbers, back)) for points in now.finished)
         return replace(now, map=found, left=left, seen=None, finished=finished)
 
-    def fallen_back(self, estimator: Estimator, predicted: Predicted) -> TrackerState:
+    def fallen_back(self, predicted: Predicted) -> TrackerState:
         """The state without landmarks by what prediction alone says of the camera: the update had a
         covariance that is not positive. The landmarks are those of the frame before."""
         slots = sorted(self.landmarks)
-        recorded = self._recorded(estimator, slots)
-        return self.coasted(estimator, predicted).given_up(estimator, slots, recorded)
+        recorded = self._recorded(slots)
+        return self.coasted(predicted).given_up(slots, recorded)
 
-    def coasted(self, estimator: Estimator, predicted: Predicted) -> TrackerState:
+    def coasted(self, predicted: Predicted) -> TrackerState:
         """The state without a measurement; `anew` where that is broken too."""
-        state, correction = estimator.correct(predicted)
+        state, correction = self.estimator.correct(predicted)
         if correction.failed:
-            return self.anew(estimator, predicted.dt)
+            return self.anew(predicted.dt)
         return self.with_map(state=state)
 
-    def anew(self, estimator: Estimator, seconds: Float[np.ndarray, ""]) -> TrackerState:
+    def anew(self, seconds: Float[np.ndarray, ""]) -> TrackerState:
         """The state with an empty filter: the camera is as far from where it was so many seconds
         ago as the prior on a start's velocity lets it be."""
         place = self.map.place.restarted()
         place = replace(place, log_unit=-place.log_scale)  # an empty state is in metres
-        now = self._begun_anew(estimator, place, number=self.map.number)
-        state, correction = estimator.correct(estimator.predict(now.map.state, seconds))
+        now = self._begun_anew(place, number=self.map.number)
+        state, correction = self.estimator.correct(self.estimator.predict(now.map.state, seconds))
         return now if correction.failed else now.with_map(state=state)
 
-    def given_up(
-        self, estimator: Estimator, slots: list[int], recorded: Points | None = None
-    ) -> TrackerState:
+    def given_up(self, slots: list[int], recorded: Points | None = None) -> TrackerState:
         """The state without the landmarks in these slots, of which this is `recorded`."""
         if not slots:
             return self
-        gone = self._recorded(estimator, slots) if recorded is None else recorded
+        gone = self._recorded(slots) if recorded is None else recorded
         landmarks = {slot: one for slot, one in self.landmarks.items() if slot not in slots}
-        state = estimator.remove(self.map.state, slots)
+        state = self.estimator.remove(self.map.state, slots)
         map = replace(self.map, state=state, landmarks=landmarks)
         return replace(self, map=map, finished=(*self.finished, gone))
 
@@ -308,58 +312,52 @@ class TrackerState:
             return self
         return replace(self, left=(*self.left, self.seen)[-KEPT:], seen=None)
 
-    def _begun_anew(self, estimator: Estimator, place: MapInWorld, number: int) -> TrackerState:
+    def _begun_anew(self, place: MapInWorld, number: int) -> TrackerState:
         """A map of this number with the landmarks that there are, and nothing else."""
         submap = self.latest_submap + 1
-        map = Map(estimator.empty(), place, self.landmarks, number, submap)
+        map = Map(self.estimator.empty(), place, self.landmarks, number, submap)
         return replace(self, map=map, latest_submap=submap)
 
-    def _with_room(
-        self, estimator: Estimator, count: int, kept: Int[np.ndarray, " n"]
-    ) -> TrackerState:
+    def _with_room(self, count: int, kept: Int[np.ndarray, " n"]) -> TrackerState:
         """Give up landmarks, except those `kept`, until there are slots for so many new ones."""
-        missing = count + len(self.landmarks) - estimator.settings.capacity
+        missing = count + len(self.landmarks) - self.estimator.settings.capacity
         if missing <= 0:
             return self
         slots = np.setdiff1d(list(self.landmarks), kept)
-        points = self._recorded(estimator, slots.tolist())
+        points = self._recorded(slots.tolist())
         some = [self.landmarks[slot] for slot in slots.tolist()]
-        worst = worst_first(some, points, estimator.settings)[:missing]
-        return self.given_up(estimator, slots[worst].tolist(), points.only(worst))
+        worst = worst_first(some, points, self.estimator.settings)[:missing]
+        return self.given_up(slots[worst].tolist(), points.only(worst))
 
-    def _free(self, estimator: Estimator, count: int) -> Int[np.ndarray, " n"]:
+    def _free(self, count: int) -> Int[np.ndarray, " n"]:
         """The first free slots."""
-        slots = range(estimator.settings.capacity)
+        slots = range(self.estimator.settings.capacity)
         return np.array([slot for slot in slots if slot not in self.landmarks][:count], int)
 
-    def _with_new(
-        self, estimator: Estimator, slots: Slots, image: Picture, pixels: Pixels
-    ) -> TrackerState:
+    def _with_new(self, slots: Slots, image: Picture, pixels: Pixels) -> TrackerState:
         """The state with landmarks in these slots, and how near all are, by which the next frame's
         unit is found."""
         first, camera = self.created, self.map.place.camera.T_wc
         landmarks = dict(self.landmarks)
         for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
             landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
-        return self.with_map(landmarks=landmarks)._measured(estimator)
+        now = self.with_map(landmarks=landmarks)
+        return now.with_map(place=replace(now.map.place, near=now._nearness()))
 
-    def _measured(self, estimator: Estimator) -> TrackerState:
-        return self.with_map(place=replace(self.map.place, near=self._nearness(estimator)))
-
-    def _nearness(self, estimator: Estimator) -> Nearness:
+    def _nearness(self) -> Nearness:
         """Return the nearness of all landmarks, as long as the filter's unit is not fixed."""
         if self.map.place.unit_fixed:
             return {}
         numbers = {slot: one.number for slot, one in self.landmarks.items()}
-        return nearness(numbers, estimator.points(self.map.state)[0])
+        return nearness(numbers, self.estimator.points(self.map.state)[0])
 
     def _nowhere(self, slots: list[int]) -> Points:
         """Landmarks that the filter gave up, since no point of the world is seen there."""
         n = len(slots)
         return self._of(slots, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan))
 
-    def _recorded(self, estimator: Estimator, slots: list[int]) -> Points:
-        return self._of(slots, *(part[slots] for part in estimator.points(self.map.state)))
+    def _recorded(self, slots: list[int]) -> Points:
+        return self._of(slots, *(part[slots] for part in self.estimator.points(self.map.state)))
 
     def _of(self, slots: list[int], points: np.ndarray, covariances: np.ndarray) -> Points:
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)

@@ -7,20 +7,18 @@ that are remembered share submaps, once. Of a filter's own pytrees the leaves ar
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from jaxslam._runtime.files import Json, one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
-from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.landmarks import Landmark, Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.patches import Patch
@@ -101,76 +99,65 @@ class _Teller:
 
 
 def _names(record: type) -> list[str]:
-    """The fields of a record that are told: not what it could compute again, nor the camera."""
+    """The fields of a record that are told: not what it could compute again, nor the filter."""
     if not is_dataclass(record):
         return list(Points._fields)
     return [one.name for one in fields(record) if one.compare and one.name != "calibration"]
 
 
-@dataclass(frozen=True)
-class Saved:
-    """The content of a file."""
+class Resumable(Protocol):
+    """What has a state: that before the first frame, when it is new."""
 
-    path: str | Path
-    header: Mapping[str, Json]
-    arrays: Mapping[str, np.ndarray]
-    calibration: Calibration
-    settings: TrackerSettings
-
-    def state(self, estimator: Estimator) -> TrackerState:
-        """The state of a tracker with this filter. Raises ValueError, as for `read`."""
-        with _damaged(self.path), jax.enable_x64(True):
-            state = _Reader(self, estimator).state
-            if not isinstance(state, TrackerState):
-                raise TypeError("it has no state")
-            return state
+    state: TrackerState
 
 
-def read(path: str | Path, *, own_filter: bool) -> Saved:
-    """Read a file; `own_filter` if the tracker's filter is not in the settings.
+T = TypeVar("T", bound=Resumable)
+
+
+def load(
+    path: str | Path, make: Callable[[Calibration, TrackerSettings], T], *, own_filter: bool
+) -> T:
+    """Read the tracker in a file by `make`; `own_filter` if its filter is not in the settings.
 
     Raises ValueError for a file that is none, or of another filter.
     """
     header, arrays = read_record(path)
     if header.get("filter") is not None and not own_filter:
         raise ValueError(f"{path} was saved with the filter {header['filter']}; pass that filter")
-    with _damaged(path):
+    try:
         given = header["settings"]
         if set(given) != {one.name for one in fields(TrackerSettings)}:
             raise ValueError(f"{path} was saved by another version, with different settings")
-        settings = TrackerSettings(**given)
-        return Saved(path, header, arrays, from_fields(header["calibration"]), settings)
-
-
-@contextmanager
-def _damaged(path: str | Path) -> Generator[None]:
-    try:
-        yield
+        tracker = make(from_fields(header["calibration"]), TrackerSettings(**given))
+        with jax.enable_x64(True):
+            tracker.state = _Reader(header, arrays, tracker.state).state
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise ValueError(f"{path} is damaged ({one_line(error)})") from None
+    return tracker
 
 
 class _Reader:
-    """Makes of what was told what it was."""
+    """Makes of what was told what it was, of the tracker that begins with the state `new`."""
 
-    def __init__(self, saved: Saved, estimator: Estimator) -> None:
-        self._saved, self._estimator = saved, estimator
-        self._like = {"state": estimator.empty()}
-        self._arrays, ends = [], dict.fromkeys(saved.arrays, 0)
-        for name, shape in saved.header["arrays"]:
+    def __init__(
+        self, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray], new: TrackerState
+    ) -> None:
+        self._new, self._like = new, {"state": new.map.state}
+        ends = dict.fromkeys(arrays, 0)
+        self._arrays: list[np.ndarray] = []
+        for name, shape in header["arrays"]:
             begin = ends[name]
             ends[name] += int(np.prod(shape, dtype=int))
-            self._arrays.append(saved.arrays[name][begin : ends[name]].reshape(shape))
+            self._arrays.append(arrays[name][begin : ends[name]].reshape(shape))
         self._records: list[object] = []
         kinds = {kind.__name__: kind for kind in _RECORDS}
-        for name, record in saved.header["records"]:
+        for name, record in header["records"]:
             parts = {key: self._field(key, told) for key, told in record.items()}
-            if name == "TrackerState":
-                parts["calibration"] = saved.calibration
-            self._records.append(kinds[name](**parts))
-        self.state = self._value(saved.header["state"])
+            made = partial(replace, new) if name == "TrackerState" else kinds[name]
+            self._records.append(made(**parts))
+        self.state = self._value(header["state"])
 
-    def _value(self, told: Json) -> object:
+    def _value(self, told: Json) -> Json:
         if isinstance(told, list):
             return tuple(self._value(x) for x in told)
         if not isinstance(told, dict):
@@ -179,18 +166,19 @@ class _Reader:
             return {self._value(key): self._value(x) for key, x in told["pairs"]}
         return self._records[told["record"]] if "record" in told else self._arrays[told["array"]]
 
-    def _field(self, name: str, told: Json) -> object:
-        return self._tree(name, self._value(told)) if name in _TREES else self._value(told)
-
-    def _tree(self, name: str, leaves: PyTree) -> PyTree:
-        """The filter's pytree of these leaves. Raises ValueError where it has others."""
+    def _field(self, name: str, told: Json) -> Json:
+        """A field's value. Raises ValueError where a filter's pytree has other leaves."""
+        value = self._value(told)
+        if name not in _TREES:
+            return value
         if name not in self._like:
-            slam, state = self._estimator.slam, self._like["state"]
-            self._like[name] = shapes(slam, state, self._estimator.settings.capacity)[0]
+            slam, state = self._new.estimator.slam, self._new.map.state
+            capacity = self._new.estimator.settings.capacity
+            self._like[name] = shapes(slam, state, capacity)[0]
         old, structure = jax.tree.flatten(self._like[name])
-        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in old]:
+        if [(x.shape, x.dtype) for x in value] != [(x.shape, x.dtype) for x in old]:
             raise ValueError("the saved state belongs to a different filter")
-        return jax.tree.unflatten(structure, [jnp.asarray(x) for x in leaves])
+        return jax.tree.unflatten(structure, [jnp.asarray(x) for x in value])
 
 
 def write_record(

@@ -16,7 +16,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark
-from jaxslam.tracking.map import Map
+from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
 from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
 from jaxslam.tracking.patches import Picture
@@ -60,6 +60,11 @@ class Policy:
     ambiguous_start: bool
     """Whether the filter welcomes matches of a start that no linear prediction expects."""
 
+    @classmethod
+    def of(cls, calibration: Calibration, estimator: Estimator) -> Policy:
+        """That of a filter and its settings."""
+        return cls(calibration, estimator.settings, estimator.slam.ambiguous_start)
+
     @property
     def in_wide(self) -> list[Association]:
         """The associations that are tried where ellipses are wide: the quick one first."""
@@ -70,16 +75,15 @@ class Policy:
     def observed(
         self,
         image: Picture,
-        map: Map,
-        estimator: Estimator,
+        state: TrackerState,
         predicted: Predicted,
         *,
         lost: bool,
-        doubtful: bool,
     ) -> tuple[Observations, Lost | None, bool]:
         """The landmarks that a picture is searched for, and which matches of them are believed; or
-        why none are; and whether another motion is as likely, which it may have been before
-        (`doubtful`). What was known before the search is what the table says of each."""
+        why none are; and whether another motion is as likely. What was known before the search is
+        what the table says of each."""
+        map, estimator, doubtful = state.map, state.estimator, state.doubtful
         expected = map.place.expected(predicted.view)
         look = partial(search, image, map.landmarks)
         # One linear update from matches that no linear prediction expects would be wrong, and sure.

@@ -5,11 +5,13 @@ It is a fold: `step` takes a `TrackerState` and a frame to the next state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
+import cv2
 import jax
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -25,17 +27,24 @@ from jaxslam.tracking.estimator import Correction, Estimator
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.patches import Pixels, Places
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
+from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
 
+SAME, NEARLY = 0.5, 0.1
+"""RMS of the difference of two pictures that are one: grey levels, and the share of what a picture
+changed before. A camera's own noise is more; what a film's compression leaves of it is less."""
+MOST_REPEATS = 3
+"""Pictures in a row that are taken for one which a film has several times."""
 Stepped = tuple[TrackerState, Tracked]
 """The state after a frame, and what became of the frame."""
 
@@ -45,7 +54,8 @@ def start(
 ) -> TrackerState:
     """The state before the first frame of a camera with this calibration."""
     with jax.enable_x64(True):
-        return TrackerState(calibration, Map(Estimator.of(slam, settings).empty()))
+        estimator = Estimator.of(slam, settings)
+        return TrackerState(estimator, calibration, Map(estimator.empty()))
 
 
 def step(
@@ -59,8 +69,8 @@ def step(
     that are known.
 
     A frame after which the camera's pose is not finite is lost: the tracker goes on from the state
-    before it. Raises ValueError for a frame of another size than the calibration's, or not later
-    than the one before.
+    before it. A picture that is the one before once more is not used. Raises ValueError for a frame
+    of another size than the calibration's, or not later than the one before.
     """
     check_size(f"frame {frame.index}", frame.image, state.calibration)
     before = -np.inf if state.time is None else state.time
@@ -69,185 +79,184 @@ def step(
             f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
             f"previous frame, {before} s"
         )
-    with jax.enable_x64(True):
-        now = _Step(Estimator.of(slam, settings), frame)
-        try:
-            after, tracked = now.taken(state, sighting)
-        except (FloatingPointError, LinAlgError):
-            after, tracked = now.broken(state)
+    waited = 0.0 if state.time is None else frame.time - state.time + state.waiting
+    apart = _apart(state.image, frame.image)
+    if not state.unmeasured and apart <= max(SAME, NEARLY * state.apart):
+        # The camera is where this picture was taken. What comes after few such pictures has their
+        # time too; after many the camera, or the picture, stood still.
+        waiting = waited if state.repeats < MOST_REPEATS else 0.0
+        after = replace(state, repeats=state.repeats + 1, waiting=waiting)
+        tracked = Tracked.of(frame, state.map, repeated=True)
+    else:
+        with jax.enable_x64(True):
+            state = replace(state, estimator=Estimator.of(slam, settings))
+            try:
+                after, tracked = _taken(state, frame, waited, sighting)
+            except (FloatingPointError, LinAlgError):
+                after, tracked = _broken(state, frame, waited)
+        image, apart = frame.image.copy(), apart if np.isfinite(apart) else 0.0
+        after = replace(after, image=image, apart=apart, repeats=0, waiting=0.0)
     return replace(after, time=frame.time, steps=state.steps + 1), tracked
 
 
-@dataclass(frozen=True)
-class _Step:
-    """What a frame makes of a state."""
+def _apart(one: np.ndarray | None, other: np.ndarray) -> float:
+    """RMS of the difference of two pictures, grey levels."""
+    return np.inf if one is None else cv2.norm(one, other, cv2.NORM_L2) / math.sqrt(other.size)
 
-    estimator: Estimator
-    frame: Frame
 
-    def taken(self, state: TrackerState, sighting: TargetObservation | None) -> Stepped:
-        """The frame, whatever is known."""
-        if state.searching:
-            return self._searching(state)
-        if state.time is None:
-            return self._first(state, sighting)
-        return self._next(state, self.frame.time - state.time)
+def _taken(
+    state: TrackerState, frame: Frame, seconds: float, sighting: TargetObservation | None
+) -> Stepped:
+    """The frame, so many seconds after the latest one that was used."""
+    policy = Policy.of(state.calibration, state.estimator)
+    if state.time is None:
+        state.estimator.compile(policy.in_wide)
+    if state.searching:
+        return _searching(state, frame, policy)
+    if state.time is not None:
+        return _next(state, frame, policy, seconds)
+    pixels, depths = _corners(state, frame), None
+    if sighting is not None:
+        pixels, depths = places_with_target(sighting, pixels, state.estimator.settings)
+    return _begun(state, frame, pixels, depths)
 
-    def broken(self, state: TrackerState) -> Stepped:
-        """A frame that leads to numbers which are not finite: a new map where the camera was."""
-        state = replace(
-            _with_failure(state, "not_finite").remembered(), unmeasured=state.unmeasured + 1
-        )
-        try:
-            # Of a frame that may not have been the filter's first.
-            dt = np.asarray(0.0 if state.time is None else self.frame.time - state.time)
-            begun = state.given_up(self.estimator, sorted(state.landmarks))
-            return self._lost(begun.anew(self.estimator, dt), Lost.NOT_FINITE)
-        except (FloatingPointError, LinAlgError):
-            return state, Tracked.of(self.frame, state.map, reason=Lost.NOT_FINITE)
 
-    def _corners(self, occupied: np.ndarray | None = None) -> np.ndarray:
-        return bare_corners(self.frame.image, self.estimator.settings, occupied)
+def _broken(state: TrackerState, frame: Frame, seconds: float) -> Stepped:
+    """A frame that leads to numbers which are not finite: a new map where the camera was."""
+    state = _with_failure(state, "not_finite").remembered()
+    state = replace(state, unmeasured=state.unmeasured + 1)
+    try:
+        begun = state.given_up(sorted(state.landmarks)).anew(np.asarray(seconds))
+        return _lost(begun, frame, Lost.NOT_FINITE)
+    except (FloatingPointError, LinAlgError):
+        return state, Tracked.of(frame, state.map, reason=Lost.NOT_FINITE)
 
-    def _policy(self, state: TrackerState) -> Policy:
-        estimator = self.estimator
-        return Policy(state.calibration, estimator.settings, estimator.slam.ambiguous_start)
 
-    def _searching(self, state: TrackerState) -> Stepped:
-        """Look for a map that is known; begin another where there was none for long."""
-        found = known_again(self.frame.image, self.estimator, self._policy(state), state)
+def _corners(state: TrackerState, frame: Frame, occupied: Pixels | None = None) -> Places:
+    return bare_corners(frame.image, state.estimator.settings, occupied)
+
+
+def _searching(state: TrackerState, frame: Frame, policy: Policy) -> Stepped:
+    """Look for a map that is known; begin another where there was none for long."""
+    found = known_again(frame.image, policy, state)
+    if found is not None:
+        return _back(frame, *found)
+    state, corners = replace(state, unmeasured=state.unmeasured + 1), _corners(state, frame)
+    if state.unmeasured <= state.estimator.settings.lost_for or len(corners) < LEAST_MATCHES:
+        return state, Tracked.of(frame, state.map, reason=Lost.NOTHING_EXPECTED)
+    return _begun(replace(state, unmeasured=0, searching=False), frame, corners)
+
+
+def _begun(
+    state: TrackerState,
+    frame: Frame,
+    pixels: Places,
+    depths: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    seen: Observations = NOTHING,
+    reason: Lost | None = None,
+    starts: bool = True,
+) -> Stepped:
+    """Begin a map with landmarks at these pixels."""
+    state = state.begun(frame.image, pixels, depths)
+    return state, Tracked.of(frame, state.map, seen, created=pixels, reason=reason, starts=starts)
+
+
+def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> Stepped:
+    """Track a frame so many seconds after the one before."""
+    estimator, lost = state.estimator, state.unmeasured > 0
+    predicted = estimator.predict(state.map.state, seconds)
+    ahead, behind = predicted.view.sides
+    if behind > ahead and behind >= LEAST_MATCHES:
+        # Nobody is to come back to it.
+        state = replace(state, reversed=state.reversed + 1, seen=None)
+        return _lost(state.coasted(predicted), frame, Lost.REVERSED)
+    seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
+    # Of two motions that contradict each other a place that is known says no more: it is one of
+    # both.
+    elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
+    state = replace(state, doubtful=doubtful, elsewhere=elsewhere and reason is not None)
+    if reason is not None:
+        state = state.remembered()
+    if state.elsewhere and lost:
+        found = known_again(frame.image, policy, state)
         if found is not None:
-            return self._back(*found)
-        state, corners = replace(state, unmeasured=state.unmeasured + 1), self._corners()
-        waits = state.unmeasured <= self.estimator.settings.lost_for
-        if waits or len(corners) < LEAST_MATCHES:
-            return state, Tracked.of(self.frame, state.map, reason=Lost.NOTHING_EXPECTED)
-        state = replace(state, unmeasured=0, searching=False)
-        return self._begun(state, corners, starts=True)
-
-    def _first(self, state: TrackerState, sighting: TargetObservation | None) -> Stepped:
-        """Begin the first map with the first frame."""
-        self.estimator.compile(self._policy(state).in_wide)
-        pixels, depths = self._corners(), None
-        if sighting is not None:
-            pixels, depths = places_with_target(sighting, pixels, self.estimator.settings)
-        return self._begun(state, pixels, depths, starts=True)
-
-    def _begun(
-        self,
-        state: TrackerState,
-        pixels: np.ndarray,
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
-        **found: Any,
-    ) -> Stepped:
-        """Begin a map with landmarks at these pixels."""
-        state = state.begun(self.estimator, self.frame.image, pixels, depths)
-        return state, Tracked.of(self.frame, state.map, created=pixels, **found)
-
-    def _next(self, state: TrackerState, seconds: float) -> Stepped:
-        """Track a frame so many seconds after the one before."""
-        frame, estimator, policy = self.frame, self.estimator, self._policy(state)
-        predicted = estimator.predict(state.map.state, seconds)
-        ahead, behind = predicted.view.sides
-        if behind > ahead and behind >= LEAST_MATCHES:
-            # Nobody is to come back to it.
-            state = replace(state, reversed=state.reversed + 1, seen=None)
-            return self._lost(state.coasted(estimator, predicted), Lost.REVERSED)
-        lost, doubtful = state.unmeasured > 0, state.doubtful
-        seen, reason, doubtful = policy.observed(
-            frame.image, state.map, estimator, predicted, lost=lost, doubtful=doubtful
-        )
-        # Of two motions that contradict each other a place that is known says no more: it is one of
-        # both.
-        elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
-        state = replace(state, doubtful=doubtful, elsewhere=elsewhere and reason is not None)
-        if reason is not None:
-            state = state.remembered()
-        if state.elsewhere and lost:
-            found = known_again(frame.image, estimator, policy, state)
-            if found is not None:
-                return self._back(*found)
-        seen = state.map.weighed(seen, estimator.settings)
-        belief, correction = estimator.correct(predicted, seen)
-        if correction.failed:
-            state = _with_failure(state, Status(int(correction.status)).name.lower())
-            fallen = state.remembered().fallen_back(estimator, predicted)
-            return self._lost(fallen, Lost.NOT_POSITIVE)
-        seen = seen.but_for(correction.used)
-        last = state.map.place.camera.T_wc
-        state = state.with_map(state=belief).noted(estimator, seen, predicted)
-        if reason is None:
-            state = replace(state, seen=None)
-        if reason is None and not seen.matched.any():
-            reason = Lost.REFUSED
-        return self._corrected(state, last, seen, correction, reason)
-
-    def _corrected(
-        self,
-        state: TrackerState,
-        last: np.ndarray,
-        seen: Observations,
-        correction: Correction,
-        reason: Lost | None,
-    ) -> Stepped:
-        """Renew the map after an update, and look for places that are known; `last` is T of the
-        camera before."""
-        frame, estimator, settings = self.frame, self.estimator, self.estimator.settings
-        if reason is None:
-            measured = max(state.restarts, state.map.number)
-            state = replace(state, unmeasured=0, restarts=measured)
-        else:
-            state = replace(state, unmeasured=state.unmeasured + 1)
-        if not state.landmarks or state.unmeasured > settings.lost_for:
-            return self._lost(state, reason or Lost.NOTHING_EXPECTED, seen)
-        kept = in_view(state.landmarks, seen.slots, settings)
+            return _back(frame, *found)
+    seen = state.map.weighed(seen, estimator.settings)
+    belief, correction = estimator.correct(predicted, seen)
+    if correction.failed:
+        state = _with_failure(state, Status(int(correction.status)).name.lower())
+        return _lost(state.remembered().fallen_back(predicted), frame, Lost.NOT_POSITIVE)
+    seen = seen.but_for(correction.used)
+    after = state.with_map(state=belief).noted(seen, predicted)
+    if reason is None:
+        after = replace(after, seen=None)
+    if reason is None and not seen.matched.any():
+        reason = Lost.REFUSED
+    kept = in_view(after.landmarks, seen.slots, estimator.settings)
+    created = np.zeros((0, 2))
+    if reason is None:
+        measured = max(after.restarts, after.map.number)
+        after = replace(after, unmeasured=0, restarts=measured)
+    else:
+        after = replace(after, unmeasured=after.unmeasured + 1)
+    if not after.landmarks or after.unmeasured > estimator.settings.lost_for:
+        return _lost(after, frame, reason or Lost.NOTHING_EXPECTED, seen)
+    if reason is None:
         # What a lost camera sees may be another place: it is not put into this map.
-        created = np.zeros((0, 2)) if reason is not None else self._corners(seen.places[kept])
-        ended = len(state.map.submaps)
-        state = state.renewed(estimator, frame.image, created, seen.slots[kept])
-        if reason is None and state.steps % LOOKED_EVERY == 0:
-            found = known_elsewhere(frame.image, estimator, self._policy(state), state)
-            if found is not None:
-                return self._joined(last, *found)
-        loop = None
-        if len(state.map.submaps) > ended:
-            closed = close_loop(frame.image, estimator, state)
-            if closed is not None:
-                state, place = closed
-                state = replace(state, refused=state.refused + (not place.believed))
-                loop = place.submap if place.believed else None
-        if reason is None and state.steps % NOTED_EVERY == 0:
-            state = state.with_map(landmarks=with_looks(state.landmarks, frame.image))
-        return state, Tracked.of(
-            frame, state.map, seen, correction, created=created, reason=reason, loop=loop
-        )
+        created = _corners(after, frame, seen.places[kept])
+    after = after.renewed(frame.image, created, seen.slots[kept])
+    loop = None
+    if reason is None and state.steps % LOOKED_EVERY == 0:
+        found = known_elsewhere(frame.image, policy, after)
+        if found is not None:
+            return _joined(frame, state.map.place.camera.T_wc, *found)
+    if len(after.map.submaps) > len(state.map.submaps):
+        after, loop = _closed(after, frame)
+    if reason is None and state.steps % NOTED_EVERY == 0:
+        after = after.with_map(landmarks=with_looks(after.landmarks, frame.image))
+    outcome = {"created": created, "reason": reason, "loop": loop}
+    return after, Tracked.of(frame, after.map, seen, correction, **outcome)
 
-    def _joined(
-        self, last: np.ndarray, state: TrackerState, seen: Observations, correction: Correction
-    ) -> Stepped:
-        """Go on in another map, which this one is joined to."""
-        before = state.left[-1]
-        state, tracked = self._back(state, seen, correction)
-        join = join_of(self.estimator, before, state.map, state.steps, last)
-        return replace(state, joins=state.joins + (() if join is None else (join,))), tracked
 
-    def _back(self, state: TrackerState, seen: Observations, correction: Correction) -> Stepped:
-        """Go on in a map in which the camera was found again."""
-        estimator, nothing = self.estimator, np.zeros((0, 2))
-        state = state.noted(estimator, seen).renewed(estimator, self.frame.image, nothing)
-        state = state.with_map(state=estimator.at_rest(state.map.state))
-        state = replace(state, unmeasured=0, searching=False, doubtful=False)
-        return state, Tracked.of(self.frame, state.map, seen, correction, relocalised=True)
+def _closed(state: TrackerState, frame: Frame) -> tuple[TrackerState, int | None]:
+    """The state, and the number of the earlier submap that it now knows to be here."""
+    closed = close_loop(frame.image, state)
+    if closed is None:
+        return state, None
+    state, place = closed
+    if place.believed:
+        return state, place.submap
+    return replace(state, refused=state.refused + 1), None
 
-    def _lost(self, state: TrackerState, reason: Lost, seen: Observations = NOTHING) -> Stepped:
-        """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
-        corners, number = self._corners(), state.map.number
-        state = state.renewed(self.estimator, self.frame.image, corners[:0])
-        if len(corners) < LEAST_MATCHES:
-            return state, Tracked.of(self.frame, state.map, seen, reason=reason)
-        state = replace(state.restarted(self.estimator), unmeasured=0, doubtful=False)
-        starts = state.map.number != number
-        return self._begun(state, corners, observations=seen, reason=reason, starts=starts)
+
+def _joined(
+    frame: Frame, last: Transform, state: TrackerState, seen: Observations, correction: Correction
+) -> Stepped:
+    """Go on in another map, which this one is joined to; `last` is T of the camera before."""
+    before = state.left[-1]
+    state, tracked = _back(frame, state, seen, correction)
+    join = join_of(before, state, last)
+    return replace(state, joins=state.joins + (() if join is None else (join,))), tracked
+
+
+def _back(frame: Frame, state: TrackerState, seen: Observations, correction: Correction) -> Stepped:
+    """Go on in a map in which the camera was found again."""
+    state = state.noted(seen).renewed(frame.image, np.zeros((0, 2)))
+    state = state.with_map(state=state.estimator.at_rest(state.map.state))
+    state = replace(state, unmeasured=0, searching=False, doubtful=False)
+    return state, Tracked.of(frame, state.map, seen, correction, relocalised=True)
+
+
+def _lost(state: TrackerState, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Stepped:
+    """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
+    corners, number = _corners(state, frame), state.map.number
+    state = state.renewed(frame.image, corners[:0])
+    if len(corners) < LEAST_MATCHES:
+        return state, Tracked.of(frame, state.map, seen, reason=reason)
+    state = replace(state.restarted(), unmeasured=0, doubtful=False)
+    starts = state.map.number != number
+    return _begun(state, frame, corners, seen=seen, reason=reason, starts=starts)
 
 
 def _with_failure(state: TrackerState, name: str) -> TrackerState:
@@ -282,8 +291,6 @@ class Tracker:
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
     """The name in the settings, or the class of your own filter."""
-    estimator: Estimator = field(init=False, repr=False)
-    """The filter."""
     state: TrackerState = field(init=False, repr=False)
     """All that is known after the latest frame."""
 
@@ -298,9 +305,8 @@ class Tracker:
         made = settings.make_filter(self.calibration) if own is None else own
         made = trackable(self.filter_name, made, settings, self.target)
         self.state = start(made, settings, self.calibration)
-        self.estimator = Estimator.of(made, settings)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str):
         """What the state says."""
         if name == "state":  # not made yet
             raise AttributeError(name)
@@ -325,7 +331,7 @@ class Tracker:
 
     def compile(self) -> None:
         """Compile all programs now; else the first frames wait for it, and a camera does not."""
-        policy = Policy(self.calibration, self.settings, self.estimator.slam.ambiguous_start)
+        policy = Policy.of(self.calibration, self.estimator)
         with jax.enable_x64(True):
             for thread in self.estimator.compile(policy.in_wide):
                 thread.join()
@@ -333,13 +339,13 @@ class Tracker:
     def points(self) -> Points:
         """Return all landmarks, those gone included."""
         with jax.enable_x64(True):
-            return self.state.points(self.estimator)
+            return self.state.points()
 
     def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
         """Return the frames so far, and all landmarks, as all that was seen later has them: loops
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
-            return joined(self.state.joins, *smoothed(self.estimator, self.state, history))
+            return joined(self.state.joins, *smoothed(self.state, history))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
@@ -364,10 +370,7 @@ class Tracker:
         If it had a `filter` of your own, pass that again. Raises ValueError for a file
         that is none, or of another filter.
         """
-        saved = persistence.read(path, own_filter=filter is not None)
-        tracker = cls(saved.calibration, saved.settings, filter)
-        tracker.state = saved.state(tracker.estimator)
-        return tracker
+        return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
 
     @classmethod
     def localising(
@@ -384,7 +387,7 @@ class Tracker:
                 f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
             )
         with jax.enable_x64(True):
-            state = tracker.state.departed(tracker.estimator)
+            state = tracker.state.departed()
         joins = tuple(replace(one, step=-1) for one in state.joins)
         tracker.state = replace(
             state,
@@ -394,5 +397,6 @@ class Tracker:
             unmeasured=1,
             searching=True,
             doubtful=False,
+            image=None,
         )
         return tracker

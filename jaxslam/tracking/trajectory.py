@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
-from jaxslam.io.tum import write_tum
 from jaxslam.tracking.pose_with_covariance import Positions
 
 TRACKED = Convention("split", "body")
@@ -45,14 +44,6 @@ class RelativeError(TypedDict):
     translation: float
     rotation: float
     way: float
-
-
-def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
-    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
-
-    All poses of a map are in one unit of length (docs/gauge.md), and the header says so.
-    """
-    write_tum(path, times, T_wc, "in the unit of each map (frames.csv)")
 
 
 def write_covariances(

@@ -146,7 +146,7 @@ def test_where_nothing_returns_no_loop_is_looked_for(walk):
     tracker, *_ = walk
     noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
     with jax.enable_x64(True):
-        assert close_loop(noise, tracker.estimator, tracker.state) is None
+        assert close_loop(noise, tracker.state) is None
 
 
 def test_a_loop_weighs_as_the_pixels_do(walk):
@@ -238,7 +238,8 @@ def test_a_place_is_known_again_by_twelve_landmarks_that_are_two_fifths(
     )  # fmt: skip
     pixels = {number: np.zeros(2) for number in numbers.tolist()}
     map = SimpleNamespace(place=MapInWorld())
-    state: Any = SimpleNamespace(charted=pixels, map=map, calibration=None)
+    estimator = SimpleNamespace(settings=SETTINGS)
+    state: Any = SimpleNamespace(charted=pixels, map=map, calibration=None, estimator=estimator)
     found = 0
 
     def searched(*_, several):
@@ -250,7 +251,7 @@ def test_a_place_is_known_again_by_twelve_landmarks_that_are_two_fifths(
     monkeypatch.setattr(closing, "_expected", lambda *_: anything)
     monkeypatch.setattr(closing, "search", searched)
     for found in (least - 1, least):
-        place = closing._seen_in(anything, submap, pixels, state, SETTINGS)
+        place = closing._seen_in(anything, submap, pixels, state)
         assert (place is None) == (found < least)
     assert place is not None
     np.testing.assert_array_equal(place[0], numbers[:least])

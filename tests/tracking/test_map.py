@@ -1,6 +1,7 @@
 """The map's upkeep: which landmarks are searched, in view, and given up."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,7 +223,7 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
     tracker = Tracker(source.calibration, settings)
     away = range(4, 45)
     hiding(monkeypatch, lambda number: number < 4 and index in away)
-    for index, image in enumerate([*there, *there[::-1]]):
+    for index, image in enumerate([*there, *there[-2::-1]]):
         tracker.step(image, index / 30)
         unseen = {one.number: one.unseen for one in tracker.landmarks.values()}
         if index == away[-1]:
@@ -249,10 +250,11 @@ class Broken(Estimator):
 @pytest.mark.usefixtures("unchecked")
 def test_a_filter_that_is_begun_anew_in_metres_goes_on_in_the_unit_of_its_map():
     """Of which it had believed that it is 2 m."""
-    broken = Broken(None, SETTINGS)
+    nothing: Any = None
+    broken = Broken(nothing, SETTINGS)
     place = MapInWorld(log_unit=0.3, log_scale=np.log(2.0))
-    state = TrackerState(CAMERA, Map("of before", place))
-    after = state.coasted(broken, broken.predict(None, 0.1))
+    state = TrackerState(broken, CAMERA, Map("of before", place))
+    after = state.coasted(broken.predict(None, 0.1))
     assert after.map.state == "empty"
     assert after.map.place.unit == pytest.approx(0.5)
 

@@ -81,7 +81,7 @@ def test_another_room_is_another_map_and_the_first_is_known_again():
     assert set(points.maps.tolist()) == {0, 1}
     # A map that comes next has a number of its own.
     with jax.enable_x64(True):
-        assert tracker.state.restarted(tracker.estimator).map.number == 2
+        assert tracker.state.restarted().map.number == 2
 
 
 def source_frame(source):

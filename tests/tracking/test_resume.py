@@ -8,7 +8,7 @@ import pytest
 import jaxslam
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.io.pictures import as_grey
-from jaxslam.tracking.persistence import read, save
+from jaxslam.tracking.persistence import save
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -83,8 +83,7 @@ def test_what_several_records_share_is_written_once_and_shared_again(video, tmp_
     kept = replace(state, seen=state.map, left=(state.map, replace(state.map, number=7)))
     save(tmp_path / "once.npz", state, SETTINGS, None)
     save(tmp_path / "t.npz", kept, SETTINGS, None)
-    read_again = read(tmp_path / "t.npz", own_filter=False)
-    again = read_again.state(tracker.estimator)
+    again = Tracker.load(tmp_path / "t.npz").state
     assert again.seen is again.map is again.left[0]
     assert again.left[1].landmarks[2] is again.map.landmarks[2]
     assert list(again.landmarks) == list(state.landmarks)

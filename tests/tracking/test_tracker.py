@@ -196,7 +196,7 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
     columns = "frame,time,state,map,matches,nis,nis_dof,sigma_position,sigma_orientation"
     assert (
         ",".join(rows[0])
-        == columns + ",sigma_log_scale,log_scale,unit_fixed,reason,relocalised,submap,loop"
+        == columns + ",sigma_log_scale,log_scale,unit_fixed,reason,relocalised,submap,loop,repeated"
     )
     assert [row["state"] for row in rows] == ["start"] + ["tracked"] * (FRAMES - 1)
     assert {row["reason"] for row in rows} == {""}

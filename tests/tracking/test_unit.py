@@ -17,7 +17,7 @@ from jaxslam.geometry import scaled
 from jaxslam.tracking import search as searching
 from jaxslam.tracking.estimator import CameraReport
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
-from jaxslam.tracking.report import write_frames
+from jaxslam.tracking.report import frames_text
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -277,7 +277,7 @@ def test_frames_csv_says_what_the_unit_is_taken_for(wanders, started, tmp_path):
         for result in started.results
     ]
     for history, log_scales in ((wanders.results, None), (doubtful, 0.1 * np.arange(FRAMES))):
-        write_frames(tmp_path / "frames.csv", history)
+        (tmp_path / "frames.csv").write_text(frames_text(history))
         with (tmp_path / "frames.csv").open() as file:
             rows = list(csv.DictReader(file))
         fixed = [int(result.unit_fixed) for result in history]

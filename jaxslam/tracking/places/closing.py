@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.observations import Prediction, Slots
 from jaxslam.tracking.patches import Picture
@@ -26,7 +25,6 @@ from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.search import search
-from jaxslam.tracking.settings import TrackerSettings
 
 APART = 3
 """The fewest submaps from the end of one loop to that of the next, besides an eighth of all: the
@@ -50,12 +48,10 @@ class Closed(NamedTuple):
         return self.nis < GATE
 
 
-def close_loop(
-    image: Picture, estimator: Estimator, state: TrackerState
-) -> tuple[TrackerState, Closed] | None:
+def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, Closed] | None:
     """Return which earlier submap the picture at the end of the latest one shows, and the state,
     which has learnt of it if that is believed."""
-    map, settings, slam = state.map, estimator.settings, estimator.slam
+    map, settings, slam = state.map, state.estimator.settings, state.estimator.slam
     *earlier, latest = map.submaps
     if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < max(APART, len(earlier) // 8):
         return None
@@ -69,7 +65,7 @@ def close_loop(
     for p in np.argsort(shown)[::-1][:TRIED].tolist():
         if shown[p] < FEWEST:
             return None
-        found = _seen_in(image, earlier[p], by_number, state, settings)
+        found = _seen_in(image, earlier[p], by_number, state)
         if found is None:
             continue
         which = p, len(earlier)
@@ -87,12 +83,12 @@ def _seen_in(
     submap: Submap,
     by_number: Mapping[int, Float[np.ndarray, " 2"]],
     state: TrackerState,
-    settings: TrackerSettings,
 ) -> tuple[Slots, Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
     sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)
     numbers, calibration = submap.numbers.tolist(), state.calibration
+    settings = state.estimator.settings
     known = [slot for slot, n in enumerate(numbers) if sure[slot] and n in by_number]
     at = np.array([by_number[numbers[slot]] for slot in known]).reshape(-1, 2)
     posed = pose_of(submap.points[known], at, calibration)

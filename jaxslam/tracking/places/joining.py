@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import median_abs_deviation
 
-from jaxslam.tracking.estimator import Correction, Estimator
+from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations
@@ -31,7 +31,7 @@ LOOKED_EVERY = 15
 
 
 def known_elsewhere(
-    image: Picture, estimator: Estimator, policy: Policy, state: TrackerState
+    image: Picture, policy: Policy, state: TrackerState
 ) -> tuple[TrackerState, Observations, Correction] | None:
     """Do what `known_again` does for a camera that is not lost and maps that are not joined to its
     own."""
@@ -39,9 +39,9 @@ def known_elsewhere(
     own = _world(number, joins)
     same = {one.number for one in state.left if _world(one.number, joins) == own}
     others = [one for one in state.left if one.number not in same]
-    if not (others and state.map.place.unit_fixed and in_submaps(estimator.slam)):
+    if not (others and state.map.place.unit_fixed and in_submaps(state.estimator.slam)):
         return None
-    return known_again(image, estimator, policy, state.remembered(), but=same | {number})
+    return known_again(image, policy, state.remembered(), but=same | {number})
 
 
 def _world(number: int, joins: Sequence[Join]) -> int:
@@ -51,10 +51,10 @@ def _world(number: int, joins: Sequence[Join]) -> int:
     return number
 
 
-def join_of(estimator: Estimator, before: Map, now: Map, step: int, last: Transform) -> Join | None:
+def join_of(before: Map, state: TrackerState, last: Transform) -> Join | None:
     """The map as it was `before` joined to that in which the camera was known again in this frame;
     `last` is T of the camera in the frame before. None where too few landmarks are of both."""
-    settings, slam = estimator.settings, estimator.slam
+    settings, slam, now = state.estimator.settings, state.estimator.slam, state.map
     (pixels, z, variance), (others, depths, variances) = (
         _depths(one, one.graph(settings, slam).present) for one in (before, now)
     )
@@ -76,7 +76,7 @@ def join_of(estimator: Estimator, before: Map, now: Map, step: int, last: Transf
     common = max(float(np.median(variance[i] + variances[j])) - scatter, 0.0)
     sigma = float(np.sqrt(common + np.pi / 2 * scatter / len(ratios)))
     moved = np.linalg.inv(last) @ before.place.camera.T_wc
-    return Join(before.number, now.number, step, moved, ratio, sigma)
+    return Join(before.number, now.number, state.steps, moved, ratio, sigma)
 
 
 def joined(

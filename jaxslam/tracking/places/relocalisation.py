@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from jaxslam.filters.protocol import Belief
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.estimator import Correction, Estimator
+from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Picture
@@ -75,16 +75,12 @@ def pose_of(
 
 
 def known_again(
-    image: Picture,
-    estimator: Estimator,
-    policy: Policy,
-    state: TrackerState,
-    but: Container[int] = (),
+    image: Picture, policy: Policy, state: TrackerState, but: Container[int] = ()
 ) -> tuple[TrackerState, Observations, Correction] | None:
     """Return what is found of the landmarks in the first place that the picture shows, of those of
     which it shows the most candidates, and of all maps `but` some, and the state in that map,
     corrected by them. None where it shows none that is known."""
-    if not estimator.displaceable:
+    if not state.estimator.displaceable:
         return None
     numbers, pixels = candidates(state.described(), described_corners(image))
     by_number = dict(zip(numbers.tolist(), pixels, strict=True))
@@ -93,24 +89,23 @@ def known_again(
     for which in np.argsort(np.negative(shown), stable=True)[:TRIED].tolist():
         if shown[which] < FEWEST:
             return None
-        found = _found(image, by_number, estimator, policy, replace(state, map=places[which]))
+        found = _found(image, by_number, policy, replace(state, map=places[which]))
         if found is not None:
             belief, seen, correction = found
             after = replace(places[which], state=belief)
-            return state.come_back(estimator, places[which], after), seen, correction
+            return state.come_back(places[which], after), seen, correction
     return None
 
 
 def _found(
     image: Picture,
     by_number: Mapping[int, Float[np.ndarray, " 2"]],
-    estimator: Estimator,
     policy: Policy,
     state: TrackerState,
 ) -> tuple[Belief, Observations, Correction] | None:
     """The landmarks of this map in a picture that shows some at these pixels, and what they make of
     it."""
-    map, place = state.map, state.map.place
+    map, place, estimator = state.map, state.map.place, state.estimator
     known = {slot: one.number for slot, one in map.landmarks.items() if one.number in by_number}
     slots = np.array(list(known), int)
     pixels = np.array([by_number[number] for number in known.values()]).reshape(-1, 2)
@@ -128,9 +123,7 @@ def _found(
     moved = np.linalg.inv(T_last) @ T_new
     predicted = estimator.displaced(map.state, moved, sigma, (1 / 30))
     # What is only tried is no memory of the policy's.
-    seen, reason, _ = policy.observed(
-        image, map, estimator, predicted, lost=True, doubtful=state.doubtful
-    )
+    seen, reason, _ = policy.observed(image, state, predicted, lost=True)
     if reason is not None or seen.matched.sum() < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
     belief, correction = estimator.correct(predicted, seen)

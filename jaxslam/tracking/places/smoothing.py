@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
@@ -21,17 +20,15 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform,
 from jaxslam.tracking.report import Tracked
 
 
-def smoothed(
-    estimator: Estimator, state: TrackerState, history: Sequence[Tracked]
-) -> tuple[list[Tracked], Points]:
+def smoothed(state: TrackerState, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
     """Return the frames and landmarks as they are known now; those of maps with one submap, and of
     maps that no camera can come back to, stay as they are."""
-    before = state.points(estimator)
+    before = state.points()
     frames, points = list(history), before
     # What branches off is of two: the way from there on, and what led there as the latest has it.
     for one in (*state.known()[::-1], state.map):
         if one.submaps:
-            graph = one.graph(estimator.settings, estimator.slam)
+            graph = one.graph(state.estimator.settings, state.estimator.slam)
             parts = _parts(one, graph, graph.solved())
             for i, camera in _cameras(parts, history).items():
                 frames[i] = replace(history[i], camera=camera)
