@@ -44,6 +44,12 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text, whole or not at all."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def append_whole(path: str | Path, text: str) -> None:
     """Add text to a file, all of it or nothing. Raises OSError."""
     data = text.encode()
@@ -72,9 +78,7 @@ def read_json(path: str | Path, what: str, parse: Callable[[Json], T]) -> T:
 
 def write_json(path: str | Path, value: Json, **options: Any) -> None:
     """Write a value as JSON, whole or not at all; `options` are `json.dumps`'s."""
-    text = json.dumps(value, indent=1, **options) + "\n"
-    with write_atomically(path) as temporary:
-        temporary.write_text(text)
+    write_text(path, json.dumps(value, indent=1, **options) + "\n")
 
 
 def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:

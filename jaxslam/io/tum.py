@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.files import LARGEST, write_atomically
+from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam.io.text import read_table
 
 
@@ -69,8 +69,7 @@ def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarr
 
 def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> None:
     """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all."""
-    with write_atomically(path) as temporary:
-        temporary.write_text(tum_text(times, T_wc, remark), encoding="utf-8")
+    write_text(path, tum_text(times, T_wc, remark))
 
 
 def tum_text(times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> str:
@@ -91,8 +90,7 @@ def write_table(
     path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
 ) -> None:
     """Write what `table_text` makes of them, whole or not at all."""
-    with write_atomically(path) as temporary:
-        temporary.write_text(table_text(header, times, table, what, number), encoding="utf-8")
+    write_text(path, table_text(header, times, table, what, number))
 
 
 def table_text(header: str, times: ArrayLike, table: np.ndarray, what: str, number: str) -> str:

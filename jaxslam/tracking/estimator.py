@@ -232,10 +232,8 @@ class Estimator:
     ) -> tuple[Belief, CameraReport]:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
-        if depths is None:
-            return self._created(_begin_map, state, slots, pixels)
         known = jax.tree.map(jnp.asarray, depths)
-        return self._created(partial(_begin_known, known), state, slots, pixels)
+        return self._created(_begin_map, state, slots, pixels, known)
 
     def renew(self, state: Belief, slots: Slots, pixels: Pixels) -> tuple[Belief, CameraReport]:
         """End the frame with new landmarks at these pixels."""
@@ -282,7 +280,7 @@ class Estimator:
                 lambda: _renew_map.compile(slam, state, new), lambda: self.camera(state), *graph
             ),
             in_background(
-                lambda: _begin_map.compile(slam, state, new),
+                lambda: _begin_map.compile(slam, state, new, None),
                 lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
                 *(partial(believed, one) for one in (*wide, None)),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),
@@ -325,8 +323,10 @@ class Estimator:
         state: Belief,
         slots: Slots,
         pixels: Pixels,
+        *depths: PyTree,
     ) -> tuple[Belief, CameraReport]:
-        state, found = create(self.slam, state, _padded(slots, pixels, self.settings.wanted))
+        new = _padded(slots, pixels, self.settings.wanted)
+        state, found = create(self.slam, state, new, *depths)
         report = CameraReport(*jax.device_get(found))
         _check_finite(report.T_wc, report.covariance)
         return state, report
@@ -444,16 +444,15 @@ def _correct(
 
 
 @Program
-def _begin_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Belief, Report]:
-    state = slam.init(slam.in_map(state).size, new)
-    return state, _reported(slam, state)
-
-
-@Program
-def _begin_known(
-    depths: tuple[jax.Array, jax.Array], slam: AbstractSlam, state: Belief, new: Features
+def _begin_map(
+    slam: AbstractStaged, state: Belief, new: Features, depths: tuple[jax.Array, jax.Array] | None
 ) -> tuple[Belief, Report]:
-    state = init_with_depths(slam, slam.in_map(state).size, new, depths)
+    capacity = slam.in_map(state).size
+    if depths is None:
+        state = slam.init(capacity, new)
+    else:
+        assert isinstance(slam, AbstractSlam)
+        state = init_with_depths(slam, capacity, new, depths)
     return state, _reported(slam, state)
 
 

@@ -81,10 +81,6 @@ class Points(NamedTuple):
         return Points(*(part[which] for part in self))
 
 
-_NONE = np.zeros(0, int)
-NO_POINTS = Points(_NONE, _NONE, _NONE, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
-
-
 def joined(parts: list[Points]) -> Points:
     """Several as one; there is at least one."""
     return Points(*(np.concatenate(of_all) for of_all in zip(*parts, strict=True)))

@@ -186,10 +186,7 @@ class TrackerState:
         return self.with_map(landmarks=landmarks).given_up(vain)
 
     def begun(
-        self,
-        image: Picture,
-        pixels: Pixels,
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
     ) -> TrackerState:
         """Landmarks at these pixels begin a map that has none; `depths` as `Estimator`'s."""
         slots = self._free(len(pixels))
@@ -198,10 +195,7 @@ class TrackerState:
         return begun._with_new(slots, image, pixels)
 
     def renewed(
-        self,
-        image: Picture,
-        pixels: Pixels,
-        kept: Int[np.ndarray, " n"] = NO_SLOTS,
+        self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS
     ) -> TrackerState:
         """The state at the end of the filter's frame, with new landmarks at these pixels, for which
         others than those in the slots `kept` make room."""
@@ -210,7 +204,9 @@ class TrackerState:
         state, report = self.estimator.renew(now.map.state, slots, pixels)
         now = now.with_map(state=state)
         if gone := [slot for slot in now.landmarks if not report.in_map[slot]]:
-            now = now.given_up(gone, now._nowhere(gone))
+            # No point of the world is seen there.
+            nowhere = np.full((len(gone), 3), np.nan), np.full((len(gone), 3, 3), np.nan)
+            now = now.given_up(gone, now._of(gone, *nowhere))
         found = [one.number for one in now.landmarks.values() if one.found]
         place = now.map.place.followed(report, now._nearness(), found)
         now = now.with_map(place=place)._with_new(slots, image, pixels)
@@ -238,9 +234,8 @@ class TrackerState:
     def restarted(self) -> TrackerState:
         """The state without landmarks: another map begins where the camera is. One that was never
         measured is none, and has its number."""
-        now = self.given_up(sorted(self.landmarks))._with_seen_kept()
-        place = now.map.place.restarted()
-        return now._begun_anew(place, number=now.restarts + 1)
+        now = self._abandoned()
+        return now._begun_anew(now.map.place.restarted(), number=now.restarts + 1)
 
     def departed(self) -> TrackerState:
         """The state without landmarks: what comes next is in another world, unless it is known."""
@@ -261,9 +256,7 @@ class TrackerState:
         Where that is an earlier submap, the next one is of another branch than what came after it,
         which is kept as one more map that was left.
         """
-        now = self
-        if known is not self.seen:
-            now = now.given_up(sorted(now.landmarks))._with_seen_kept()
+        now = self if known is self.seen else self._abandoned()
         left = tuple(one for one in now.left if one is not known)
         if not any(known is one for one in self.known()):
             number = now.latest_submap + 1
@@ -306,11 +299,10 @@ class TrackerState:
         map = replace(self.map, state=state, landmarks=landmarks)
         return replace(self, map=map, finished=(*self.finished, gone))
 
-    def _with_seen_kept(self) -> TrackerState:
-        """Among the maps that were left is the one that was last seen."""
-        if self.seen is None:
-            return self
-        return replace(self, left=(*self.left, self.seen)[-KEPT:], seen=None)
+    def _abandoned(self) -> TrackerState:
+        """The state without landmarks, and with the map as it was seen last among those left."""
+        left = (*self.left, *([] if self.seen is None else [self.seen]))[-KEPT:]
+        return replace(self.given_up(sorted(self.landmarks)), left=left, seen=None)
 
     def _begun_anew(self, place: MapInWorld, number: int) -> TrackerState:
         """A map of this number with the landmarks that there are, and nothing else."""
@@ -350,11 +342,6 @@ class TrackerState:
             return {}
         numbers = {slot: one.number for slot, one in self.landmarks.items()}
         return nearness(numbers, self.estimator.points(self.map.state)[0])
-
-    def _nowhere(self, slots: list[int]) -> Points:
-        """Landmarks that the filter gave up, since no point of the world is seen there."""
-        n = len(slots)
-        return self._of(slots, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan))
 
     def _recorded(self, slots: list[int]) -> Points:
         return self._of(slots, *(part[slots] for part in self.estimator.points(self.map.state)))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +105,7 @@ def _names(record: type) -> list[str]:
     return [one.name for one in fields(record) if one.compare and one.name != "calibration"]
 
 
+@runtime_checkable
 class Resumable(Protocol):
     """What has a state: that before the first frame, when it is new."""
 

@@ -73,12 +73,7 @@ class Policy:
         return list(dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association])))
 
     def observed(
-        self,
-        image: Picture,
-        state: TrackerState,
-        predicted: Predicted,
-        *,
-        lost: bool,
+        self, image: Picture, state: TrackerState, predicted: Predicted, *, lost: bool
     ) -> tuple[Observations, Lost | None, bool]:
         """The landmarks that a picture is searched for, and which matches of them are believed; or
         why none are; and whether another motion is as likely. What was known before the search is

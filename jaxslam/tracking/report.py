@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._runtime.files import append_whole, write_atomically
+from jaxslam._runtime.files import append_whole, write_text
 from jaxslam.io.source import Frame
 from jaxslam.io.tum import tum_text
 from jaxslam.tracking.estimator import Correction
@@ -159,29 +159,18 @@ def frames_text(history: Sequence[Tracked]) -> str:
     return file.getvalue()
 
 
-class Growing:
-    """`trajectory.txt` and `frames.csv` in a folder: at any time whole, of the frames so far."""
+TEXTS = {"trajectory.txt": trajectory_text, "frames.csv": frames_text}
+"""Files that grow with every frame."""
 
-    def __init__(self, out: Path) -> None:
-        texts = {"trajectory.txt": trajectory_text, "frames.csv": frames_text}
-        self._texts = {out / name: text for name, text in texts.items()}
 
-    def add(self, history: Sequence[Tracked]) -> None:
-        """Add the latest frame; an interruption of the first two leaves nothing."""
-        for path, text in self._texts.items():
-            if len(history) > 2:
-                append_whole(path, text(history[-1:]).splitlines(keepends=True)[-1])
-            elif len(history) == 2:
-                self._write(path, text(history))
-
-    def finish(self, history: Sequence[Tracked]) -> None:
-        """Write all frames as they are known in the end."""
-        for path, text in self._texts.items():
-            self._write(path, text(history))
-
-    def _write(self, path: Path, text: str) -> None:
-        with write_atomically(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+def add_latest(out: Path, history: Sequence[Tracked]) -> None:
+    """Add the latest frame to the files in a folder, which are whole at any time; an interruption
+    of the first two leaves none."""
+    for name, text in TEXTS.items():
+        if len(history) > 2:
+            append_whole(out / name, text(history[-1:]).splitlines(keepends=True)[-1])
+        elif len(history) == 2:
+            write_text(out / name, text(history))
 
 
 def _row(result: Tracked) -> dict[str, object]:

@@ -80,8 +80,8 @@ def step(
             f"previous frame, {before} s"
         )
     waited = 0.0 if state.time is None else frame.time - state.time + state.waiting
-    apart = _apart(state.image, frame.image)
-    if not state.unmeasured and apart <= max(SAME, NEARLY * state.apart):
+    apart, known = _apart(state.image, frame.image), state.landmarks and not state.unmeasured
+    if known and apart <= max(SAME, NEARLY * state.apart):
         # The camera is where this picture was taken. What comes after few such pictures has their
         # time too; after many the camera, or the picture, stood still.
         waiting = waited if state.repeats < MOST_REPEATS else 0.0
@@ -118,7 +118,8 @@ def _taken(
     pixels, depths = _corners(state, frame), None
     if sighting is not None:
         pixels, depths = places_with_target(sighting, pixels, state.estimator.settings)
-    return _begun(state, frame, pixels, depths)
+    state = state.begun(frame.image, pixels, depths)
+    return state, Tracked.of(frame, state.map, created=pixels, starts=True)
 
 
 def _broken(state: TrackerState, frame: Frame, seconds: float) -> Stepped:
@@ -144,22 +145,8 @@ def _searching(state: TrackerState, frame: Frame, policy: Policy) -> Stepped:
     state, corners = replace(state, unmeasured=state.unmeasured + 1), _corners(state, frame)
     if state.unmeasured <= state.estimator.settings.lost_for or len(corners) < LEAST_MATCHES:
         return state, Tracked.of(frame, state.map, reason=Lost.NOTHING_EXPECTED)
-    return _begun(replace(state, unmeasured=0, searching=False), frame, corners)
-
-
-def _begun(
-    state: TrackerState,
-    frame: Frame,
-    pixels: Places,
-    depths: tuple[np.ndarray, np.ndarray] | None = None,
-    *,
-    seen: Observations = NOTHING,
-    reason: Lost | None = None,
-    starts: bool = True,
-) -> Stepped:
-    """Begin a map with landmarks at these pixels."""
-    state = state.begun(frame.image, pixels, depths)
-    return state, Tracked.of(frame, state.map, seen, created=pixels, reason=reason, starts=starts)
+    state = replace(state, unmeasured=0, searching=False).begun(frame.image, corners)
+    return state, Tracked.of(frame, state.map, created=corners, starts=True)
 
 
 def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> Stepped:
@@ -189,22 +176,18 @@ def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> 
         return _lost(state.remembered().fallen_back(predicted), frame, Lost.NOT_POSITIVE)
     seen = seen.but_for(correction.used)
     after = state.with_map(state=belief).noted(seen, predicted)
-    if reason is None:
-        after = replace(after, seen=None)
+    after = replace(after, seen=None if reason is None else after.seen)
     if reason is None and not seen.matched.any():
         reason = Lost.REFUSED
     kept = in_view(after.landmarks, seen.slots, estimator.settings)
-    created = np.zeros((0, 2))
     if reason is None:
-        measured = max(after.restarts, after.map.number)
-        after = replace(after, unmeasured=0, restarts=measured)
+        after = replace(after, unmeasured=0, restarts=max(after.restarts, after.map.number))
     else:
         after = replace(after, unmeasured=after.unmeasured + 1)
     if not after.landmarks or after.unmeasured > estimator.settings.lost_for:
         return _lost(after, frame, reason or Lost.NOTHING_EXPECTED, seen)
-    if reason is None:
-        # What a lost camera sees may be another place: it is not put into this map.
-        created = _corners(after, frame, seen.places[kept])
+    # What a lost camera sees may be another place: it is not put into this map.
+    created = np.zeros((0, 2)) if reason else _corners(after, frame, seen.places[kept])
     after = after.renewed(frame.image, created, seen.slots[kept])
     loop = None
     if reason is None and state.steps % LOOKED_EVERY == 0:
@@ -254,9 +237,9 @@ def _lost(state: TrackerState, frame: Frame, reason: Lost, seen: Observations = 
     state = state.renewed(frame.image, corners[:0])
     if len(corners) < LEAST_MATCHES:
         return state, Tracked.of(frame, state.map, seen, reason=reason)
-    state = replace(state.restarted(), unmeasured=0, doubtful=False)
+    state = replace(state.restarted(), unmeasured=0, doubtful=False).begun(frame.image, corners)
     starts = state.map.number != number
-    return _begun(state, frame, corners, seen=seen, reason=reason, starts=starts)
+    return state, Tracked.of(frame, state.map, seen, created=corners, reason=reason, starts=starts)
 
 
 def _with_failure(state: TrackerState, name: str) -> TrackerState:

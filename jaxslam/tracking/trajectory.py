@@ -99,12 +99,10 @@ def absolute_trajectory_error(
     }
 
 
-def orientation_error(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> float:
+def orientation_error(*trajectories: ArrayLike) -> float:
     """The `orientation_rmse` of `absolute_trajectory_error`, of the same arguments, also of cameras
     that only turn. Raises ValueError where fewer than three poses pair up."""
-    pairs = _paired(estimate_times, estimate, reference_times, reference)
+    pairs = _paired(*trajectories)
     return _by_orientation(pairs.estimate, pairs.reference)[1]
 
 
@@ -137,12 +135,10 @@ def relative_pose_error(
     }
 
 
-def alignment(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> Similarity:
+def alignment(*trajectories: ArrayLike) -> Similarity:
     """Return the similarity from the estimate's world to the reference's: that of
     `absolute_trajectory_error`, of the same arguments; it raises the same."""
-    return _paired(estimate_times, estimate, reference_times, reference).alignment()
+    return _paired(*trajectories).alignment()
 
 
 class _Pairs(NamedTuple):
@@ -162,13 +158,9 @@ class _Pairs(NamedTuple):
         return self.alignment().moved(self.estimate)
 
 
-def _paired(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> _Pairs:
+def _paired(*trajectories: ArrayLike) -> _Pairs:
     """Poses of the same time. Raises ValueError for fewer than three."""
-    times, T, true_times, true = (
-        np.asarray(x, float) for x in (estimate_times, estimate, reference_times, reference)
-    )
+    times, T, true_times, true = (np.asarray(x, float) for x in trajectories)
     theirs, ours = associated(true_times, times)
     if len(ours) < 3:
         raise ValueError(

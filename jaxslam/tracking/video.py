@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam._runtime.files import write_json
+from jaxslam._runtime.files import write_json, write_text
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.source import Frame, Source
 from jaxslam.plots.tracking import plot_map
@@ -17,7 +17,7 @@ from jaxslam.tracking.film import Aside, OverlayWriter
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.overlay import overlay_of, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
-from jaxslam.tracking.report import Growing, Tracked
+from jaxslam.tracking.report import TEXTS, Tracked, add_latest
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import (
     TOO_SURE,
@@ -29,10 +29,7 @@ from jaxslam.tracking.summary import (
 )
 from jaxslam.tracking.target import Target
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import (
-    absolute_trajectory_error,
-    write_covariances,
-)
+from jaxslam.tracking.trajectory import absolute_trajectory_error, write_covariances
 from jaxslam.tracking.viewer import Viewer
 
 
@@ -71,7 +68,6 @@ def track(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
-    growing = Growing(out)
     seconds: list[float] = []
     try:
         film = out / "overlay.mp4" if overlay else None
@@ -79,23 +75,22 @@ def track(
             start = time.perf_counter()
             for frame in source:
                 history.append(tracker.track(frame))
-                growing.add(history)
+                add_latest(out, history)
                 show(frame)
                 now = time.perf_counter()
                 seconds.append(now - start)
                 start = now
                 progress(1)
-        known_now = tracker.smoothed(history)
+        smooth = tracker.smoothed(history)
     except BaseException as error:
         # After the first frame there is nothing to tell yet, and what tells it may be compiling.
         if len(history) > isinstance(error, KeyboardInterrupt):
-            as_tracked = history, tracker.points()
-            _write(source, tracker, history, as_tracked, seconds, out)
+            _write(source, tracker, history, (history, tracker.points()), seconds, out)
             if isinstance(error, KeyboardInterrupt):
                 told = f"{out} has the files of the {len(history)} frames so far"
                 raise KeyboardInterrupt(told) from None
         raise
-    return _write(source, tracker, history, known_now, seconds, out)
+    return _write(source, tracker, history, smooth, seconds, out)
 
 
 @contextmanager
@@ -144,7 +139,8 @@ def _write(
 ) -> Summary:
     """Write all files, of frames and landmarks as they are known now, and as they were `before`."""
     history, points = now
-    Growing(out).finish(history)
+    for name, text in TEXTS.items():
+        write_text(out / name, text(history))
     tracker.save(out / "map.npz")
     times = [result.time for result in history]
     scaled = any(result.sigma_log_scale is not None for result in history)

@@ -244,3 +244,11 @@ def test_seconds_of_darkness_make_no_maps():
     assert tracker.restarts == 0
     (before,) = tracker.state.left
     assert (before.number, before.landmarks.keys()) == (0, known)
+
+
+def test_darkness_before_the_first_map_is_no_repeated_picture():
+    source = small(1)
+    tracker = Tracker(source.calibration, SETTINGS)
+    dark = np.zeros((240, 320), np.uint8)
+    results = [tracker.step(dark, k / 30) for k in range(3)]
+    assert [one.state for one in results] == ["start", "lost", "lost"]

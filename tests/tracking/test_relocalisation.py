@@ -174,10 +174,11 @@ def test_landmarks_are_known_by_their_looks():
     for _ in range(LOOKS + 2):
         landmarks = with_looks(landmarks, image)
     assert {len(one.looks) for one in landmarks.values()} == {0, LOOKS}
-    slots, pixels = candidates(landmarks, described_corners(np.roll(image, (5, 12), axis=(0, 1))))
+    found = candidates(landmarks, described_corners(np.roll(image, (5, 12), axis=(0, 1))))
+    slots, pixels = np.array(list(found)), np.array(list(found.values()))
     moved = pixels - corners[slots // 2] - [12, 5]
     assert np.mean(np.linalg.norm(moved, axis=1) < 2) > 0.8
     assert len(slots) > 0.5 * there.sum()
     noise = np.random.default_rng(1).integers(0, 255, image.shape, dtype=np.uint8)
-    assert len(candidates(landmarks, described_corners(noise))[0]) < FEWEST
-    assert len(candidates(landmarks, described_corners(np.zeros_like(image)))[0]) == 0
+    assert len(candidates(landmarks, described_corners(noise))) < FEWEST
+    assert len(candidates(landmarks, described_corners(np.zeros_like(image)))) == 0

@@ -99,9 +99,8 @@ def test_the_tracker_calls_no_lapack(name_of_filter, monkeypatch):
         tracker.track(frame)
     tracker.points()
     tracker.camera()
-    # Known points begin a map by the same functions, no ellipse is curved in three frames, and
-    # no camera is lost.
-    unused = {"_remove", "_begin_known", "_curved", "_moving", "_at_rest"}
+    # No ellipse is curved in three frames, and no camera is lost.
+    unused = {"_remove", "_curved", "_moving", "_at_rest"}
     assert calls.keys() | unused == jitted.keys()
     assert len(calls) >= 6
     assert set().union(*calls.values()) == set()

@@ -7,19 +7,18 @@ where the chain of submaps, with its covariance, says that it can be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.observations import Prediction, Slots
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.places.descriptors import candidates, described_corners
+from jaxslam.tracking.places.descriptors import ByNumber, candidates, described_corners
 from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
@@ -59,8 +58,7 @@ def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, Close
     if not kept:
         return None
     gone = {number: state.charted[number] for number in kept}
-    numbers, pixels = candidates(gone, described_corners(image))
-    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
+    by_number = candidates(gone, described_corners(image))
     shown = [sum(n in by_number for n in one.numbers.tolist()) for one in earlier]
     for p in np.argsort(shown)[::-1][:TRIED].tolist():
         if shown[p] < FEWEST:
@@ -79,10 +77,7 @@ def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, Close
 
 
 def _seen_in(
-    image: Picture,
-    submap: Submap,
-    by_number: Mapping[int, Float[np.ndarray, " 2"]],
-    state: TrackerState,
+    image: Picture, submap: Submap, by_number: ByNumber, state: TrackerState
 ) -> tuple[Slots, Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""

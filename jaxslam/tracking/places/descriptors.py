@@ -19,6 +19,8 @@ LOOKS = 3
 
 Corners = tuple[Places, UInt8[np.ndarray, "n 32"]]
 """The corners of a picture: pixels and descriptors."""
+ByNumber = Mapping[int, Float[np.ndarray, " 2"]]
+"""Pixels of landmarks."""
 
 
 def describe(
@@ -55,14 +57,12 @@ def described_corners(image: Picture) -> Corners:
     return corners[there], descriptors[there]
 
 
-def candidates(
-    landmarks: Mapping[int, Landmark], corners: Corners
-) -> tuple[np.ndarray, Float[np.ndarray, "m 2"]]:
-    """Return the keys of landmarks that look like corners of a picture, and these corners."""
+def candidates(landmarks: Mapping[int, Landmark], corners: Corners) -> ByNumber:
+    """Return the corners of a picture that look like landmarks, by the keys of these."""
     owner = np.repeat(list(landmarks), [len(one.looks) for one in landmarks.values()])
     pixels, descriptors = corners
     if len(owner) == 0 or len(pixels) < 2:
-        return np.zeros(0, int), np.zeros((0, 2))
+        return {}
     looks = np.concatenate([one.looks for one in landmarks.values()])
     two = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(looks, descriptors, 2)
     best: dict[int, tuple[float, int]] = {}
@@ -71,4 +71,4 @@ def candidates(
         # The largest ratio of the distance of the most similar descriptor to that of the next.
         if first.distance < 0.85 * second.distance:
             best[slot] = min(best.get(slot, (np.inf, 0)), (first.distance, first.trainIdx))
-    return np.array(list(best), int), pixels[[corner for _, corner in best.values()]]
+    return {number: pixels[corner] for number, (_, corner) in best.items()}

@@ -8,20 +8,19 @@ is the camera back.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.filters.protocol import Belief
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
-from jaxslam.tracking.map import TrackerState
+from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.places.descriptors import candidates, described_corners
+from jaxslam.tracking.places.descriptors import ByNumber, candidates, described_corners
 from jaxslam.tracking.policy import Policy
 from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 
@@ -82,8 +81,7 @@ def known_again(
     corrected by them. None where it shows none that is known."""
     if not state.estimator.displaceable:
         return None
-    numbers, pixels = candidates(state.described(), described_corners(image))
-    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
+    by_number = candidates(state.described(), described_corners(image))
     places = [one for one in state.places() if one.number not in but]
     shown = [sum(x.number in by_number for x in one.landmarks.values()) for one in places]
     for which in np.argsort(np.negative(shown), stable=True)[:TRIED].tolist():
@@ -91,20 +89,16 @@ def known_again(
             return None
         found = _found(image, by_number, policy, replace(state, map=places[which]))
         if found is not None:
-            belief, seen, correction = found
-            after = replace(places[which], state=belief)
+            after, seen, correction = found
             return state.come_back(places[which], after), seen, correction
     return None
 
 
 def _found(
-    image: Picture,
-    by_number: Mapping[int, Float[np.ndarray, " 2"]],
-    policy: Policy,
-    state: TrackerState,
-) -> tuple[Belief, Observations, Correction] | None:
-    """The landmarks of this map in a picture that shows some at these pixels, and what they make of
-    it."""
+    image: Picture, by_number: ByNumber, policy: Policy, state: TrackerState
+) -> tuple[Map, Observations, Correction] | None:
+    """This map after a picture that shows some of its landmarks at these pixels, what is found
+    there, and what the filter made of it."""
     map, place, estimator = state.map, state.map.place, state.estimator
     known = {slot: one.number for slot, one in map.landmarks.items() if one.number in by_number}
     slots = np.array(list(known), int)
@@ -127,4 +121,5 @@ def _found(
     if reason is not None or seen.matched.sum() < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
     belief, correction = estimator.correct(predicted, seen)
-    return None if correction.failed else (belief, seen.but_for(correction.used), correction)
+    after, seen = replace(map, state=belief), seen.but_for(correction.used)
+    return None if correction.failed else (after, seen, correction)
