@@ -1,7 +1,7 @@
 """A file from which a tracker goes on: a header of words and numbers, and arrays.
 
-A state is told record by record, by the names of their fields; what several records have, as maps
-that are remembered share submaps, once. Of a filter's own pytrees the leaves are told.
+A state is written record by record, by the names of their fields. What several records share, as
+maps that are remembered share submaps, is written once, and of a filter's own pytrees the leaves.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ def save(
     path: str | Path, state: TrackerState, settings: TrackerSettings, filter_name: str | None
 ) -> None:
     """Write a tracker, whole or not at all, with the name of a filter beyond the settings."""
-    teller = _Teller()
-    told = teller.told(state)
-    arrays = [one.told for one in teller.arrays.values()]
+    writer = _Writer()
+    written = writer.written(state)
+    arrays = [one.written for one in writer.arrays.values()]
     header = {
         "calibration": as_fields(state.calibration),
         "settings": asdict(settings),
         "filter": filter_name,
-        "state": told,
-        "records": [one.told for one in teller.records.values()],
+        "state": written,
+        "records": [one.written for one in writer.records.values()],
         "arrays": [[x.dtype.name, x.shape] for x in arrays],
     }
     flat: dict[str, list[np.ndarray]] = {}
@@ -59,47 +59,47 @@ def save(
     write_record(path, header, {name: np.concatenate(some) for name, some in flat.items()})
 
 
-class _Told(NamedTuple):
-    """What was told of a value, which is kept: another could have its identity."""
+class _Written(NamedTuple):
+    """What is written of a value, which is kept: another could have its identity."""
 
     value: object
     place: int
-    told: Json
+    written: Json
 
 
 @dataclass
-class _Teller:
-    """Tells values as JSON has them, and gathers the records and arrays that these refer to."""
+class _Writer:
+    """Makes JSON of values, and gathers the records and arrays to which it refers."""
 
-    records: dict[int, _Told] = field(default_factory=dict)
+    records: dict[int, _Written] = field(default_factory=dict)
     """By their identities."""
-    arrays: dict[int, _Told] = field(default_factory=dict)
+    arrays: dict[int, _Written] = field(default_factory=dict)
 
-    def told(self, value: object) -> Json:
+    def written(self, value: object) -> Json:
         """The value: a record or an array by its place, a tuple as a list, a mapping as pairs."""
         if isinstance(value, _RECORDS):
             if id(value) not in self.records:
                 # What it refers to comes before it.
                 record = {name: self._field(value, name) for name in _names(type(value))}
-                told = [type(value).__name__, record]
-                self.records[id(value)] = _Told(value, len(self.records), told)
+                written = [type(value).__name__, record]
+                self.records[id(value)] = _Written(value, len(self.records), written)
             return {"record": self.records[id(value)].place}
         if isinstance(value, Mapping):
-            return {"pairs": [[self.told(key), self.told(x)] for key, x in value.items()]}
+            return {"pairs": [[self.written(key), self.written(x)] for key, x in value.items()]}
         if isinstance(value, tuple):
-            return [self.told(x) for x in value]
+            return [self.written(x) for x in value]
         if isinstance(value, np.ndarray | jax.Array):
-            told = _Told(value, len(self.arrays), np.asarray(value))
-            return {"array": self.arrays.setdefault(id(value), told).place}
+            written = _Written(value, len(self.arrays), np.asarray(value))
+            return {"array": self.arrays.setdefault(id(value), written).place}
         return value.item() if isinstance(value, np.generic) else value
 
     def _field(self, record: object, name: str) -> Json:
         value = getattr(record, name)
-        return self.told(tuple(jax.tree.leaves(value)) if name in _TREES else value)
+        return self.written(tuple(jax.tree.leaves(value)) if name in _TREES else value)
 
 
 def _names(record: type) -> list[str]:
-    """The fields of a record that are told: not what it could compute again, nor the filter."""
+    """The fields of a record that are written: not what it could compute again, nor the filter."""
     if not is_dataclass(record):
         return list(Points._fields)
     return [one.name for one in fields(record) if one.compare and one.name != "calibration"]
@@ -138,7 +138,7 @@ def load(
 
 
 class _Reader:
-    """Makes of what was told what it was, of the tracker that begins with the state `new`."""
+    """Makes of what was written what it was, of a tracker that begins with the state `new`."""
 
     def __init__(
         self, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray], new: TrackerState
@@ -153,23 +153,27 @@ class _Reader:
         self._records: list[object] = []
         kinds = {kind.__name__: kind for kind in _RECORDS}
         for name, record in header["records"]:
-            parts = {key: self._field(key, told) for key, told in record.items()}
+            parts = {key: self._field(key, written) for key, written in record.items()}
             made = partial(replace, new) if name == "TrackerState" else kinds[name]
             self._records.append(made(**parts))
         self.state = self._value(header["state"])
 
-    def _value(self, told: Json) -> Json:
-        if isinstance(told, list):
-            return tuple(self._value(x) for x in told)
-        if not isinstance(told, dict):
-            return told
-        if "pairs" in told:
-            return {self._value(key): self._value(x) for key, x in told["pairs"]}
-        return self._records[told["record"]] if "record" in told else self._arrays[told["array"]]
+    def _value(self, written: Json) -> Json:
+        if isinstance(written, list):
+            return tuple(self._value(x) for x in written)
+        if not isinstance(written, dict):
+            return written
+        if "pairs" in written:
+            return {self._value(key): self._value(x) for key, x in written["pairs"]}
+        return (
+            self._records[written["record"]]
+            if "record" in written
+            else self._arrays[written["array"]]
+        )
 
-    def _field(self, name: str, told: Json) -> Json:
+    def _field(self, name: str, written: Json) -> Json:
         """A field's value. Raises ValueError where a filter's pytree has other leaves."""
-        value = self._value(told)
+        value = self._value(written)
         if name not in _TREES:
             return value
         if name not in self._like:

@@ -174,7 +174,7 @@ def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:
     return np.where(found[:, None], corners.astype(float), pixels)
 
 
-_Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"]]
+_Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " distortion"]]
 """Intrinsics and distortion, as OpenCV takes them."""
 
 
