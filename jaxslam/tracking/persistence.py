@@ -153,27 +153,23 @@ class _Reader:
         self._records: list[object] = []
         kinds = {kind.__name__: kind for kind in _RECORDS}
         for name, record in header["records"]:
-            parts = {key: self._field(key, written) for key, written in record.items()}
+            parts = {key: self._field(key, given) for key, given in record.items()}
             made = partial(replace, new) if name == "TrackerState" else kinds[name]
             self._records.append(made(**parts))
         self.state = self._value(header["state"])
 
-    def _value(self, written: Json) -> Json:
-        if isinstance(written, list):
-            return tuple(self._value(x) for x in written)
-        if not isinstance(written, dict):
-            return written
-        if "pairs" in written:
-            return {self._value(key): self._value(x) for key, x in written["pairs"]}
-        return (
-            self._records[written["record"]]
-            if "record" in written
-            else self._arrays[written["array"]]
-        )
+    def _value(self, given: Json) -> Json:
+        if isinstance(given, list):
+            return tuple(self._value(x) for x in given)
+        if not isinstance(given, dict):
+            return given
+        if "pairs" in given:
+            return {self._value(key): self._value(x) for key, x in given["pairs"]}
+        return self._records[given["record"]] if "record" in given else self._arrays[given["array"]]
 
-    def _field(self, name: str, written: Json) -> Json:
+    def _field(self, name: str, given: Json) -> Json:
         """A field's value. Raises ValueError where a filter's pytree has other leaves."""
-        value = self._value(written)
+        value = self._value(given)
         if name not in _TREES:
             return value
         if name not in self._like:
