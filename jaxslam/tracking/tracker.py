@@ -195,22 +195,11 @@ def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> 
         if found is not None:
             return _joined(frame, state.map.place.camera.T_wc, *found)
     if len(after.map.submaps) > len(state.map.submaps):
-        after, loop = _closed(after, frame)
+        after, loop = close_loop(frame.image, after)
     if reason is None and state.steps % NOTED_EVERY == 0:
         after = after.with_map(landmarks=with_looks(after.landmarks, frame.image))
     outcome = {"created": created, "reason": reason, "loop": loop}
     return after, Tracked.of(frame, after.map, seen, correction, **outcome)
-
-
-def _closed(state: TrackerState, frame: Frame) -> tuple[TrackerState, int | None]:
-    """The state, and the number of the earlier submap that it now knows to be here."""
-    closed = close_loop(frame.image, state)
-    if closed is None:
-        return state, None
-    state, place = closed
-    if place.believed:
-        return state, place.submap
-    return replace(state, refused=state.refused + 1), None
 
 
 def _joined(

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,6 +22,8 @@ from jaxslam.io.tum import read_tum
 from jaxslam.tracking import estimator as programs
 from jaxslam.tracking import report
 from jaxslam.tracking import video as tracking
+from jaxslam.tracking.places.smoothing import smoothed
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import describe
 from jaxslam.tracking.synthetic import add_noise, synthetic_source
@@ -120,6 +124,19 @@ def test_a_smoothing_that_fails_leaves_the_files_of_all_frames_as_they_were_trac
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert (tmp_path / "summary.json").exists()
     assert (tmp_path / "map.npz").exists()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_map_that_cannot_be_smoothed_stays_as_it_was_tracked():
+    """Submaps and loops can leave an information matrix that is singular."""
+    solved = SimpleNamespace(T_bc=np.full((2, 4, 4), np.nan), covariances=np.zeros((2, 6, 6)))
+    map = SimpleNamespace(number=3, submaps=("one",), graph=lambda *_: graph)
+    graph = SimpleNamespace(solved=lambda: solved)
+    estimator = SimpleNamespace(settings=None, slam=None)
+    points, history = object(), [report.Tracked(0, 0.0, PoseWithCovariance())]
+    state: Any = SimpleNamespace(map=map, estimator=estimator, known=list, points=lambda: points)
+    with pytest.warns(UserWarning, match="map 3 cannot be smoothed"):
+        assert smoothed(state, history) == (history, points)
 
 
 def test_a_summary_that_fails_leaves_trajectory_and_map(tmp_path, monkeypatch):

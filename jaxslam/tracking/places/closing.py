@@ -8,7 +8,6 @@ where the chain of submaps, with its covariance, says that it can be.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -33,36 +32,23 @@ GATE = 9 * float(chi2.ppf(0.999, 6))
 pictures a drift is up to 2.5 times what its σ says; another place is off by ten times that."""
 
 
-class Closed(NamedTuple):
-    """A place that was known again."""
-
-    submap: int
-    """The number of the submap that it is of, among those of all maps."""
-    nis: float
-    """The NIS of the place, with six degrees of freedom."""
-
-    @property
-    def believed(self) -> bool:
-        """Whether it can be there."""
-        return self.nis < GATE
-
-
-def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, Closed] | None:
-    """Return which earlier submap the picture at the end of the latest one shows, and the state,
-    which has learnt of it if that is believed."""
+def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, int | None]:
+    """Return the state, which has learnt of the earlier submap that the picture at the end of the
+    latest one shows, and the number of that submap; None where there is none, or not to be believed
+    (`refused`)."""
     map, settings, slam = state.map, state.estimator.settings, state.estimator.slam
     *earlier, latest = map.submaps
     if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < max(APART, len(earlier) // 8):
-        return None
+        return state, None
     kept = state.charted.keys() - set(latest.numbers.tolist())
     if not kept:
-        return None
+        return state, None
     gone = {number: state.charted[number] for number in kept}
     by_number = candidates(gone, described_corners(image))
     shown = [sum(n in by_number for n in one.numbers.tolist()) for one in earlier]
     for p in np.argsort(shown)[::-1][:TRIED].tolist():
         if shown[p] < FEWEST:
-            return None
+            return state, None
         found = _seen_in(image, earlier[p], by_number, state)
         if found is None:
             continue
@@ -70,10 +56,10 @@ def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, Close
         # σ of a landmark where its patch is found, pixels: it is seen from elsewhere, or later.
         loop = loop_of(slam, map.submaps, which, *found, 1.0, settings.wanted)
         compared = map.graph(settings, slam).with_loop(loop)
-        closed = Closed(earlier[p].number, float(compared.nis))
-        known = replace(state, map=map.learnt(loop, compared)) if closed.believed else state
-        return known, closed
-    return None
+        if not compared.nis < GATE:
+            return replace(state, refused=state.refused + 1), None
+        return replace(state, map=map.learnt(loop, compared)), earlier[p].number
+    return state, None
 
 
 def _seen_in(
