@@ -132,6 +132,8 @@ def load(
         tracker = make(from_fields(header["calibration"]), TrackerSettings(**given))
         with jax.enable_x64(True):
             tracker.state = _Reader(header, arrays, tracker.state).state
+            if not isinstance(tracker.state, TrackerState):
+                raise TypeError("it has no state")
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise ValueError(f"{path} is damaged ({one_line(error)})") from None
     return tracker

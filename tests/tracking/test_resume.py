@@ -11,7 +11,7 @@ from jaxslam.io.pictures import as_grey
 from jaxslam.tracking.persistence import save
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.tracker import Tracker, start, step
 
 FRAMES, HALF = 10, 5
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
@@ -50,6 +50,24 @@ def test_step_is_track_with_the_frames_counted(video):
     for frame in frames[:3]:
         same(one.track(frame), other.step(frame.image, frame.time))
     assert one.steps == other.steps == 3
+
+
+def test_a_tracker_is_a_fold_and_a_state_that_is_kept_is_gone_on_from_again(video):
+    calibration, frames = video
+    slam, tracker = SETTINGS.make_filter(calibration), Tracker(calibration, SETTINGS)
+    assert isinstance(slam, jaxslam.Slam)
+    state, kept = start(slam, SETTINGS, calibration), []
+    for frame in frames[:4]:
+        kept.append(state)
+        state, tracked = step(slam, SETTINGS, state, frame)
+        same(tracked, tracker.track(frame))
+    numbers = [(one.steps, one.created, one.map.number) for one in kept]
+    _, again = step(slam, SETTINGS, kept[2], frames[2])
+    after, _ = step(slam, SETTINGS, kept[2], replace(frames[3], image=0 * frames[3].image))
+    assert after.unmeasured == 1
+    same(step(slam, SETTINGS, kept[3], frames[3])[1], tracked)
+    assert again.index == 2
+    assert [(one.steps, one.created, one.map.number) for one in kept] == numbers
 
 
 @pytest.mark.slow
