@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -54,29 +55,23 @@ class Disturbed(NamedTuple):
     """Share of the matches of which the place is any other in the ellipse."""
 
 
-@dataclass
-class Confused(Policy):
-    """A policy whose search errs in some frames, as often as its share says."""
+class Confused:
+    """A search that errs while it is `on`, as often as its share says."""
 
-    during: range = range(0)
-    share: float = 0.0
-    seed: int = 0
-    frame: int = 0
-    """The one that comes."""
+    def __init__(self, share: float, seed: int) -> None:
+        self.share, self.on = share, False
+        self._rng, self._agreeing = np.random.default_rng(seed), Policy.agreeing
 
-    def __post_init__(self) -> None:
-        self._rng = np.random.default_rng(self.seed)
-
-    def agreeing(self, seen, matches, landmarks, agree, *, lost):
+    def agreeing(self, policy, seen, matches, landmarks, agree, *, lost):
         """With wrong places in that of the true ones."""
-        if self.frame in self.during:
+        if self.on:
             wrong = self._rng.random(len(seen.slots)) < self.share
             pixels = [
                 self._elsewhere(seen, owner) if wrong[owner] else pixel
                 for owner, pixel in zip(matches.owner, matches.pixels, strict=True)
             ]
             matches = matches._replace(pixels=np.array(pixels).reshape(-1, 2))
-        return super().agreeing(seen, matches, landmarks, agree, lost=lost)
+        return self._agreeing(policy, seen, matches, landmarks, agree, lost=lost)
 
     def _elsewhere(self, seen, row):
         angle, radius = self._rng.uniform(0, 2 * np.pi), 3 * np.sqrt(self._rng.random())
@@ -245,13 +240,12 @@ def _rendered(T_wc: np.ndarray, seed: int) -> Iterator[Frame]:
 def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[str, float]:
     """What becomes of a tracker: shares of the frames meanwhile, and in the last second."""
     tracker = Tracker(_source(1, seed).calibration, settings)
-    own, during = tracker.policy, disturbed.during if disturbed.wrong else range(0)
-    pieces = own.calibration, own.settings, own.ambiguous_start
-    tracker.policy = policy = Confused(*pieces, during=during, share=disturbed.wrong, seed=seed)
-    results = []
-    for frame in disturbed.frames:
-        policy.frame = frame.index
-        results.append(tracker.track(frame))
+    during = disturbed.during if disturbed.wrong else range(0)
+    confused, results = Confused(disturbed.wrong, seed), []
+    with mock.patch.object(Policy, "agreeing", lambda *a, **k: confused.agreeing(*a, **k)):
+        for frame in disturbed.frames:
+            confused.on = frame.index in during
+            results.append(tracker.track(frame))
     tracked = np.array([result.state == "tracked" for result in results])
     believed = tracked & [result.map == 0 for result in results]
     index = np.arange(len(results))

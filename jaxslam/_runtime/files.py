@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -43,6 +44,22 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text, whole or not at all."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def append_whole(path: str | Path, text: str) -> None:
+    """Add text to a file, all of it or nothing. Raises OSError."""
+    data = text.encode()
+    with Path(path).open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(data) < len(data):  # a disk that is full
+            file.truncate(end)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
 def read_json(path: str | Path, what: str, parse: Callable[[Json], T]) -> T:
     """Return what `parse` makes of a JSON file. Raises ValueError, naming the file, where it cannot
     be read (`what` says of what), is not JSON, or is refused by `parse`."""
@@ -61,9 +78,7 @@ def read_json(path: str | Path, what: str, parse: Callable[[Json], T]) -> T:
 
 def write_json(path: str | Path, value: Json, **options: Any) -> None:
     """Write a value as JSON, whole or not at all; `options` are `json.dumps`'s."""
-    text = json.dumps(value, indent=1, **options) + "\n"
-    with write_atomically(path) as temporary:
-        temporary.write_text(text)
+    write_text(path, json.dumps(value, indent=1, **options) + "\n")
 
 
 def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.files import LARGEST, write_atomically
+from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam.io.text import read_table
 
 
@@ -68,7 +68,12 @@ def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarr
 
 
 def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> None:
-    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all."""
+    write_text(path, tum_text(times, T_wc, remark))
+
+
+def tum_text(times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> str:
+    """Times (n,) in seconds and poses (n, 4, 4) in TUM format.
 
     Quaternions are normalised, w comes last and is not negative. The `remark` is for the header.
     """
@@ -78,20 +83,25 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str =
     table[:, 3:] = quaternions(T_wc[:, :3, :3])
     remark = f"; {remark}" if remark else ""
     header = f"tx ty tz qx qy qz qw (s; camera in the world frame{remark})"
-    write_table(path, header, times, table, "poses", ".9f")
+    return table_text(header, times, table, "poses", ".9f")
 
 
 def write_table(
     path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
 ) -> None:
+    """Write what `table_text` makes of them, whole or not at all."""
+    write_text(path, table_text(header, times, table, what, number))
+
+
+def table_text(header: str, times: ArrayLike, table: np.ndarray, what: str, number: str) -> str:
     """A line of each time and row, under a comment that names the columns after the time."""
     times = np.asarray(times, dtype=float)
     if times.shape != (len(table),):
         raise ValueError(f"{len(times)} times for {len(table)} {what}; their numbers must be equal")
-    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(f"# t {header}\n")
-        for time, row in zip(times, table, strict=True):
-            file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")
+    lines = [f"# t {header}"]
+    for time, row in zip(times, table, strict=True):
+        lines.append(f"{time:.9f} " + " ".join(format(value, number) for value in row))
+    return "\n".join(lines) + "\n"
 
 
 def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:

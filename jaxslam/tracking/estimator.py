@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -100,30 +100,34 @@ class CameraReport(NamedTuple):
     """Which slots hold a landmark: a filter gives up those that contradict a start."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Estimator:
-    """A filter and its state, which the methods replace. All are called in 64 bits."""
+    """A filter as the tracker runs it, in 64 bits: functions of its state.
+
+    Raises FloatingPointError where the camera's pose is not finite.
+    """
 
     slam: AbstractStaged
     settings: TrackerSettings
-    state: Belief = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.slam = cast(self.slam, jnp.float64)
-        self.clear()
+    @classmethod
+    def of(cls, slam: AbstractStaged, settings: TrackerSettings) -> Estimator:
+        """With the filter's numbers in 64 bits."""
+        return cls(cast(slam, jnp.float64), settings)
 
-    def clear(self) -> None:
-        """Begin with a map without landmarks."""
-        self.state = _empty(self.slam, self.settings.capacity)
+    def empty(self) -> Belief:
+        """The state of a map without landmarks."""
+        return _empty(self.slam, self.settings.capacity)
 
-    def predict(self, seconds: float | np.ndarray) -> Predicted:
-        """Return what the filter expects so many seconds after the frame before. Changes
-        nothing."""
+    def predict(self, state: Belief, seconds: float | np.ndarray) -> Predicted:
+        """Return what the filter expects so many seconds after the frame before."""
         # A number of Python's would be compiled into the program.
         dt = np.asarray(seconds)
-        (state, gaussian), joint, view = _predict(self.slam, self.state, dt)
+        (state, gaussian), joint, view = _predict(self.slam, state, dt)
         joint, view = jax.device_get((joint, view))
-        return Predicted(dt, state, gaussian, joint, Prediction(*view))
+        view = Prediction(*view)
+        _check_finite(view.T_wc)
+        return Predicted(dt, state, gaussian, joint, view)
 
     def believes(
         self,
@@ -178,7 +182,7 @@ class Estimator:
 
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:
         """Return what the filter expects of the frame given that it shows what was seen, to first
-        order and neglecting that landmarks drift. Changes nothing."""
+        order and neglecting that landmarks drift."""
         view, (n, p, _, _) = predicted.view, predicted.joint.shape
         S = predicted.joint.reshape(n * p, n * p)
         known = (p * seen.slots[:, None] + np.arange(p)).ravel()
@@ -189,17 +193,17 @@ class Estimator:
         left = np.einsum("npk,nqk->npq", gain.reshape(n, p, -1), S[:, known].reshape(n, p, -1))
         return view._replace(pixels=view.pixels + moved, covariances=view.covariances - left)
 
-    def correct(self, predicted: Predicted, seen: Observations = NOTHING) -> Correction:
-        """Update a prediction by what is matched, and move into the new camera. Changes nothing
-        where that has `failed`."""
+    def correct(
+        self, predicted: Predicted, seen: Observations = NOTHING
+    ) -> tuple[Belief, Correction]:
+        """A prediction updated by what is matched, in the new camera; nothing to go on with where
+        that has `failed`."""
         slots, wanted = seen.slots, self.settings.wanted
         factors = self.settings.noise_factors(seen.variances)
         features = _measured(_padded(slots, seen.believed, wanted), factors)
         state, correction = _correct(self.slam, predicted.state, predicted.dt, features)
         correction = Correction(*jax.device_get(correction))
-        if not correction.failed:
-            self.state = state
-        return correction._replace(used=correction.used[: len(slots)])
+        return state, correction._replace(used=correction.used[: len(slots)])
 
     @property
     def displaceable(self) -> bool:
@@ -207,52 +211,54 @@ class Estimator:
         model = self.slam.model
         return model is not None and model.motion.has_velocity
 
-    def displaced(self, T: Transform, sigma: Float[np.ndarray, " 6"], seconds: float) -> Predicted:
+    def displaced(
+        self, state: Belief, T: Transform, sigma: Float[np.ndarray, " 6"], seconds: float
+    ) -> Predicted:
         """Return what the filter expects of a camera that is at T from its latest one, in its own
-        unit, known with this σ: it has moved there within so many seconds. Changes the state."""
+        unit, known with this σ: it has moved there within so many seconds."""
         dt = np.asarray(seconds)
-        self.state = _moving(self.slam, self.state, T, sigma, dt)
-        return self.predict(dt)
+        return self.predict(_moving(self.slam, state, T, sigma, dt), dt)
 
-    def at_rest(self) -> None:
-        """Forget how the camera moves: it does as at a start."""
-        self.state = _at_rest(self.slam, self.state)
+    def at_rest(self, state: Belief) -> Belief:
+        """The state without what it knows of the camera's motion: it is as at a start."""
+        return _at_rest(self.slam, state)
 
     def begin(
-        self, slots: Slots, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> CameraReport:
+        self,
+        state: Belief,
+        slots: Slots,
+        pixels: Pixels,
+        depths: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[Belief, CameraReport]:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
-        if depths is None:
-            return self._created(_begin_map, slots, pixels)
         known = jax.tree.map(jnp.asarray, depths)
-        return self._created(partial(_begin_known, known), slots, pixels)
+        return self._created(_begin_map, state, slots, pixels, known)
 
-    def renew(self, slots: Slots, pixels: Pixels) -> CameraReport:
+    def renew(self, state: Belief, slots: Slots, pixels: Pixels) -> tuple[Belief, CameraReport]:
         """End the frame with new landmarks at these pixels."""
-        return self._created(_renew_map, slots, pixels)
+        return self._created(_renew_map, state, slots, pixels)
 
-    def remove(self, slots: list[int]) -> None:
+    def remove(self, state: Belief, slots: list[int]) -> Belief:
         """Marginalise the landmarks in these slots."""
-        gone = np.isin(np.arange(self.settings.capacity), slots)
-        self.state = _remove(self.slam, self.state, gone)
+        return _remove(self.slam, state, np.isin(np.arange(self.settings.capacity), slots))
 
-    def points(self) -> tuple[Positions, Spreads]:
+    def points(self, state: Belief) -> tuple[Positions, Spreads]:
         """Landmarks with their covariances, in the filter's own unit, from where the map begins."""
-        return jax.device_get(_world_points(self.slam, self.state, self.settings.capacity))
+        return jax.device_get(_world_points(self.slam, state, self.settings.capacity))
 
-    def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
+    def camera(self, state: Belief) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels.
         None of a filter without a pinhole camera."""
         model = self.slam.model
         if model is None or not isinstance(model.sensor, Pinhole):
             return None
-        mean, covariance = jax.device_get(_intrinsics(self.slam, self.state))
+        mean, covariance = jax.device_get(_intrinsics(self.slam, state))
         return model.calibration.name, mean, covariance
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
         """Start two threads that compile all programs in the order in which they are needed."""
-        slam, state, dt = self.slam, self.state, np.zeros(())
+        slam, state, dt = self.slam, self.empty(), np.zeros(())
         new = _padded(*_NOWHERE, self.settings.wanted)
         gone = np.zeros(self.settings.capacity, bool)
 
@@ -270,9 +276,11 @@ class Estimator:
 
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
         return [
-            in_background(lambda: _renew_map.compile(slam, state, new), self.camera, *graph),
             in_background(
-                lambda: _begin_map.compile(slam, state, new),
+                lambda: _renew_map.compile(slam, state, new), lambda: self.camera(state), *graph
+            ),
+            in_background(
+                lambda: _begin_map.compile(slam, state, new, None),
                 lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
                 *(partial(believed, one) for one in (*wide, None)),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),
@@ -310,11 +318,23 @@ class Estimator:
         return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
-        self, create: Callable[..., tuple[Belief, Report]], slots: Slots, pixels: Pixels
-    ) -> CameraReport:
+        self,
+        create: Callable[..., tuple[Belief, Report]],
+        state: Belief,
+        slots: Slots,
+        pixels: Pixels,
+        *depths: PyTree,
+    ) -> tuple[Belief, CameraReport]:
         new = _padded(slots, pixels, self.settings.wanted)
-        self.state, report = create(self.slam, self.state, new)
-        return CameraReport(*jax.device_get(report))
+        state, found = create(self.slam, state, new, *depths)
+        report = CameraReport(*jax.device_get(found))
+        _check_finite(report.T_wc, report.covariance)
+        return state, report
+
+
+def _check_finite(*arrays: np.ndarray) -> None:
+    if not all(np.isfinite(x).all() for x in arrays):
+        raise FloatingPointError("the camera's pose is not finite")
 
 
 def _solve(S: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m ..."]) -> np.ndarray:
@@ -424,16 +444,15 @@ def _correct(
 
 
 @Program
-def _begin_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Belief, Report]:
-    state = slam.init(slam.in_map(state).size, new)
-    return state, _reported(slam, state)
-
-
-@Program
-def _begin_known(
-    depths: tuple[jax.Array, jax.Array], slam: AbstractSlam, state: Belief, new: Features
+def _begin_map(
+    slam: AbstractStaged, state: Belief, new: Features, depths: tuple[jax.Array, jax.Array] | None
 ) -> tuple[Belief, Report]:
-    state = init_with_depths(slam, slam.in_map(state).size, new, depths)
+    capacity = slam.in_map(state).size
+    if depths is None:
+        state = slam.init(capacity, new)
+    else:
+        assert isinstance(slam, AbstractSlam)
+        state = init_with_depths(slam, capacity, new, depths)
     return state, _reported(slam, state)
 
 

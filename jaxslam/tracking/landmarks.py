@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.tracking.patches import STORED, Patch
+from jaxslam.tracking.patches import Patch
 
 NO_LOOKS = np.zeros((0, 32), np.uint8)
 MEMORY = 0.95
 """Weight of an innovation by that of a frame later: twenty frames count."""
 _OLDER = np.array([MEMORY, MEMORY, MEMORY**2])
-_COUNTS = ("number", "missed", "unseen", "found")
 
 
-@dataclass
+@dataclass(frozen=True)
 class Landmark:
     """The appearance and the record of the landmark in a slot."""
 
@@ -48,18 +46,19 @@ class Landmark:
         u, v, variance = self.innovations.tolist()
         return max(1.0, (u * u + v * v) / (2 * max(variance, 1.0)))
 
-    def compared(self, innovation: np.ndarray) -> None:
-        """Note a whitened innovation (2,)."""
-        self.innovations = _OLDER * self.innovations + (*innovation.tolist(), 1.0)
+    def compared(self, innovation: np.ndarray) -> Landmark:
+        """The landmark after a whitened innovation (2,)."""
+        sums = _OLDER * self.innovations + (*innovation.tolist(), 1.0)
+        return replace(self, innovations=sums)
 
-    def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
-        """Count one search, that found it at this pixel or not; `success` is an average over about
-        `patience` of them."""
-        self.success += (found - self.success) / patience
-        self.missed = 0 if found else self.missed + 1
-        if found:
-            self.unseen, self.seen_at = 0, pixel
-            self.found += 1
+    def searched(self, found: bool, pixel: np.ndarray, patience: float) -> Landmark:
+        """The landmark after one search, that found it at this pixel or not; `success` is an
+        average over about `patience` of them."""
+        success = self.success + (found - self.success) / patience
+        if not found:
+            return replace(self, success=success, missed=self.missed + 1)
+        count = self.found + 1
+        return replace(self, success=success, missed=0, unseen=0, seen_at=pixel, found=count)
 
 
 class Points(NamedTuple):
@@ -82,47 +81,6 @@ class Points(NamedTuple):
         return Points(*(part[which] for part in self))
 
 
-_NONE = np.zeros(0, int)
-NO_POINTS = Points(_NONE, _NONE, _NONE, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
-
-
 def joined(parts: list[Points]) -> Points:
     """Several as one; there is at least one."""
     return Points(*(np.concatenate(of_all) for of_all in zip(*parts, strict=True)))
-
-
-def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
-    """Return arrays of k landmarks in order of their entries, for a file."""
-    kept, count = list(landmarks.values()), len(landmarks)
-    counts = [[getattr(one, name) for name in _COUNTS] for one in kept]
-    return {
-        "slots": np.array(list(landmarks), int),
-        "counts": np.array(counts, int).reshape(count, len(_COUNTS)),
-        "success": np.array([one.success for one in kept], float),
-        "first_cameras": np.array([one.first_camera for one in kept]).reshape(count, 4, 4),
-        "seen_at": np.array([one.seen_at for one in kept], float).reshape(count, 2),
-        "innovations": np.array([one.innovations for one in kept], float).reshape(count, 3),
-        "pixels": np.array([one.patch.pixel for one in kept], float).reshape(count, 2),
-        "looks": np.concatenate([one.looks for one in kept] or [NO_LOOKS]),
-        "look_counts": np.array([len(one.looks) for one in kept], int),
-        "stored": np.array([one.patch.stored for one in kept], np.float32).reshape(
-            count, STORED, STORED
-        ),
-    }
-
-
-def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
-    """Return what `stacked` was made of."""
-    landmarks = {}
-    names = ("slots", "counts", "success", "first_cameras", "seen_at", "innovations", "pixels")
-    names += ("stored",)
-    looks = np.split(arrays["looks"], np.cumsum(arrays["look_counts"])[:-1])
-    for look, slot, counts, success, first_camera, seen_at, innovations, pixel, stored in zip(
-        looks[: len(arrays["slots"])], *(arrays[name] for name in names), strict=True
-    ):
-        number, *others = counts.tolist()
-        patch = Patch(pixel, stored)
-        landmarks[int(slot)] = Landmark(
-            number, patch, first_camera, seen_at, float(success), *others, look, innovations
-        )
-    return landmarks

@@ -1,4 +1,7 @@
-"""The map's upkeep: its landmarks and the filter's slots for them, where they are and which go."""
+"""What a tracker knows: the map that it is in, those that it may come back to, and what it counts.
+
+All are values: whoever keeps one has it, and whoever goes back goes on from it.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Patch, Picture, Pixels
-from jaxslam.tracking.places.descriptors import note_looks
+from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.submaps import (
     Compared,
     Graph,
@@ -24,7 +28,7 @@ from jaxslam.tracking.places.submaps import (
     handed_over,
 )
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.unit import MapInWorld, Nearness, nearness
+from jaxslam.tracking.unit import Join, MapInWorld, Nearness, nearness
 
 NO_SLOTS = np.zeros(0, int)
 
@@ -36,20 +40,22 @@ MOST = 512
 
 
 @dataclass(frozen=True)
-class Remembered:
-    """A map as it was in the latest frame in which it was seen."""
+class Map:
+    """A map: its landmarks, what the filter knows of them, and where it is in the world."""
 
-    number: int
-    submap: int
-    """The number of the submap that goes on."""
     state: Belief
-    landmarks: dict[int, Landmark]
-    place: MapInWorld
+    place: MapInWorld = field(default_factory=MapInWorld)
+    landmarks: Mapping[int, Landmark] = field(default_factory=dict)
+    """Those in the map, by their slot of the state."""
+    number: int = 0
+    """The number of the map, from 0."""
+    submap: int = 0
+    """The number of the submap that goes on, counted from 0 through all maps."""
     submaps: tuple[Submap, ...] = ()
     """The submaps that ended."""
     loops: tuple[LoopClosure, ...] = ()
     """The loops that join the submaps."""
-    earlier: tuple[Remembered, ...] = ()
+    earlier: tuple[Map, ...] = ()
     """The map as it was when each submap had just ended."""
 
     def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
@@ -58,38 +64,81 @@ class Remembered:
         present, _ = handed_over(slam, self.state, numbers, self.place.camera, number=self.submap)
         return Graph(slam, self.submaps, present, self.loops, settings.wanted)
 
+    def weighed(self, seen: Observations, settings: TrackerSettings) -> Observations:
+        """The table with the variances of landmarks that each have their own noise."""
+        factors = [self.landmarks[slot].noise_factor for slot in seen.slots.tolist()]
+        variances = settings.noisier(seen.variances, np.array(factors, float))
+        return seen._replace(variances=variances)
 
-@dataclass
-class Map:
-    """The landmarks of one map after another, beside the filter that estimates them."""
+    def learnt(self, loop: LoopClosure, compared: Compared) -> Map:
+        """The map with what a loop says, that ends at the camera."""
+        place = self.place.corrected(compared.T_bc, compared.covariance)
+        moved = place.camera.T_wc @ np.linalg.inv(self.place.camera.T_wc)
+        landmarks = {
+            slot: replace(one, first_camera=moved @ one.first_camera)
+            for slot, one in self.landmarks.items()
+        }
+        *before, ended = self.submaps
+        submaps, loops = (*before, replace(ended, camera=place.camera)), (*self.loops, loop)
+        now = replace(self, place=place, landmarks=landmarks, submaps=submaps, loops=loops)
+        *earlier, _ = self.earlier
+        return replace(now, earlier=(*earlier, replace(now, earlier=tuple(earlier))))
 
-    settings: TrackerSettings
-    estimator: Estimator
-    place: MapInWorld = field(default_factory=MapInWorld)
-    landmarks: dict[int, Landmark] = field(default_factory=dict)
-    """Those in the map, by their slot of the state."""
-    finished: list[Points] = field(default_factory=list)
-    """Those that left it."""
-    number: int = 0
-    """The number of the map, from 0."""
-    latest: int = 0
-    """The greatest number so far."""
-    seen: Remembered | None = None
-    """The map as it was last seen, while the camera is lost and its unit is fixed."""
-    left: list[Remembered] = field(default_factory=list)
-    """The other maps that were left, the latest last."""
-    submap: int = 0
-    """The number of the submap, counted from 0 through all maps."""
+
+@dataclass(frozen=True)
+class TrackerState:
+    """All that a tracker knows after a frame, and goes on from."""
+
+    estimator: Estimator = field(compare=False, repr=False)
+    """The filter that takes it on, which is no part of it."""
+    calibration: Calibration
+    """That of the camera."""
+    map: Map
+    time: float | None = None
+    """The time of the latest frame, s."""
+    steps: int = 0
+    """Frames given so far."""
+    unmeasured: int = 0
+    """The latest of them, in a row, in which no landmark was measured."""
+    elsewhere: bool = False
+    """Whether the map was out of view in one of them."""
+    searching: bool = False
+    """Whether no map has started because a known one may be found."""
+    image: Picture | None = None
+    """The latest picture that was used."""
+    apart: float = 0.0
+    """By how many grey levels, RMS, it is another than the one before it."""
+    repeats: int = 0
+    """How many that were the same have come since, in a row."""
+    waiting: float = 0.0
+    """The time that they took, s, which is the next picture's."""
+    doubtful: bool = False
+    """Whether two motions of the camera were as likely when there were matches last."""
+    failed: Mapping[str, int] = field(default_factory=dict)
+    """How many updates ended in which `Status` that says that their result means nothing."""
+    refused: int = 0
+    """Places that looked like earlier ones, and that cannot be these."""
+    reversed: int = 0
+    """Maps that turned out to lie behind the camera, and were given up."""
+    joins: tuple[Join, ...] = ()
+    """Maps that turned out to be of one world."""
+    restarts: int = 0
+    """The greatest number of a map that was measured: of those initialised after the first."""
     latest_submap: int = 0
     """The greatest number of a submap so far."""
-    submaps: tuple[Submap, ...] = ()
-    """The submaps of this map that ended."""
-    loops: tuple[LoopClosure, ...] = ()
-    """The loops that join these submaps."""
-    earlier: tuple[Remembered, ...] = ()
-    """The map as it was when each of these submaps had just ended."""
-    charted: dict[int, Landmark] = field(default_factory=dict)
+    finished: tuple[Points, ...] = ()
+    """Landmarks that left their maps."""
+    charted: Mapping[int, Landmark] = field(default_factory=dict)
     """The landmarks of all submaps that ended, by their numbers, as they were last."""
+    seen: Map | None = None
+    """The map as it was last seen, while the camera is lost and its unit is fixed."""
+    left: tuple[Map, ...] = ()
+    """The other maps that were left, the latest last."""
+
+    @property
+    def landmarks(self) -> Mapping[int, Landmark]:
+        """The landmarks in the map, by their slot of the filter's state."""
+        return self.map.landmarks
 
     @property
     def deleted(self) -> int:
@@ -101,232 +150,207 @@ class Map:
         """The number of landmarks so far."""
         return self.deleted + len(self.landmarks)
 
-    def points(self) -> Points:
-        """Return all landmarks, those gone included."""
-        return joined([*self.finished, self._recorded(sorted(self.landmarks))])
-
-    def described(self) -> dict[int, Landmark]:
+    def described(self) -> Mapping[int, Landmark]:
         """Return the landmarks of all maps that are known, by their numbers."""
         latest = [one for known in self.known() for one in known.landmarks.values()]
-        return self.charted | {one.number: one for one in latest}
+        return {**self.charted, **{one.number: one for one in latest}}
 
-    def weighed(self, seen: Observations) -> Observations:
-        """The table with the variances of landmarks that each have their own noise."""
-        factors = [self.landmarks[slot].noise_factor for slot in seen.slots.tolist()]
-        variances = self.settings.noisier(seen.variances, np.array(factors, float))
-        return seen._replace(variances=variances)
-
-    def note(self, seen: Observations, predicted: Predicted | None = None) -> None:
-        """Note what was found of the landmarks, where that was `predicted` by how much it is off,
-        and give up those that are searched in vain."""
-        matched = seen.labelled("matched")
-        if predicted is not None and len(matched.slots):
-            innovations = self.estimator.each_given_others(predicted, matched)
-            for slot, innovation in zip(matched.slots.tolist(), innovations, strict=True):
-                self.landmarks[slot].compared(innovation)
-        note_found(self.landmarks, seen, self.settings)
-        self.give_up(failing(self.landmarks, self.settings))
-
-    def begin(
-        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> None:
-        """Begin with landmarks at these pixels, a map that has none; `depths` as `Estimator`'s."""
-        slots = self._free(len(pixels))
-        self.place.begin(self.estimator.begin(slots, pixels, depths))
-        self._add(slots, image, pixels)
-
-    def renew(self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS) -> None:
-        """New landmarks at these pixels, for which others than those in the slots `kept` make room.
-        Ends the filter's frame."""
-        self._make_room(len(pixels), kept)
-        slots = self._free(len(pixels))
-        report = self.estimator.renew(slots, pixels)
-        if gone := [slot for slot in self.landmarks if not report.in_map[slot]]:
-            self.give_up(gone, self._nowhere(gone))
-        found = [one.number for one in self.landmarks.values() if one.found]
-        self.place.follow(report, self._nearness(), found)
-        self._add(slots, image, pixels)
-        more = self.place.unit_fixed and self.seen is None and len(self.submaps) < MOST
-        if report.left and more:
-            self._hand_over(image)
-
-    def _hand_over(self, image: Picture) -> None:
-        """End the submap at the camera, where this picture was taken."""
-        note_looks(self.landmarks.values(), image)
-        estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
-        ended, state = handed_over(
-            estimator.slam, estimator.state, numbers, self.place.camera, number=self.submap
-        )
-        estimator.state = state
-        self.submaps = (*self.submaps, ended)
-        self._begin_submap()
-        self.earlier = (*self.earlier, self.now())
-        self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
-        count = len(self.submaps)
-        soon = min(count + count // 3 + 2, MOST)
-        in_background(compile_graph(estimator.slam, state, self.settings, soon))
-
-    def learn(self, loop: LoopClosure, compared: Compared) -> None:
-        """Take over what a loop says, that ends at the camera."""
-        self.loops = (*self.loops, loop)
-        moved = self.place.correct(compared.T_bc, compared.covariance)
-        for one in self.landmarks.values():
-            one.first_camera = moved @ one.first_camera
-        *before, ended = self.submaps
-        self.submaps = (*before, replace(ended, camera=self.place.camera))
-        self.earlier = (*self.earlier[:-1], replace(self.now(), earlier=self.earlier[:-1]))
-
-    def _begin_submap(self) -> None:
-        """Give a number to the submap that begins."""
-        self.latest_submap += 1
-        self.submap = self.latest_submap
-
-    def restart(self) -> None:
-        """Give up all landmarks: another map begins where the camera is."""
-        self.give_up(sorted(self.landmarks))
-        self._keep()
-        self.latest += 1
-        self.number = self.latest
-        self.place.restart()
-        self._begin_chain()
-
-    def leave(self) -> None:
-        """Give up all landmarks: what comes next is in another world, unless it is known."""
-        self.remember()
-        self.restart()
-        self.place = MapInWorld()
-
-    def _keep(self) -> None:
-        """Keep the map as it was last seen among those that were left."""
-        if self.seen is not None:
-            self.left = [*self.left, self.seen][-KEPT:]
-        self.seen = None
-
-    def remember(self) -> None:
-        """Note the map as it was in the frame before this one, in which the camera is lost, to come
-        back to it; not while a start is being found out."""
-        if self.seen is None and self.place.unit_fixed:
-            self.seen = self.now()
-
-    def now(self) -> Remembered:
-        """Return the map as it is."""
-        kept = {slot: replace(one) for slot, one in self.landmarks.items()}
-        place, state = replace(self.place), self.estimator.state
-        chain = self.submaps, self.loops, self.earlier
-        return Remembered(self.number, self.submap, state, kept, place, *chain)
-
-    def known(self) -> list[Remembered]:
+    def known(self) -> list[Map]:
         """Return this map as it was last seen, and those that were left, the latest first."""
         return [*([] if self.seen is None else [self.seen]), *reversed(self.left)]
 
-    def places(self) -> list[Remembered]:
+    def places(self) -> list[Map]:
         """Return the maps that are `known`, and these as each submap of them began."""
         latest = self.known()
         earlier = {id(one): one for known in latest for one in known.earlier[::-1]}
         return [*latest, *earlier.values()]
 
-    def become(self, known: Remembered) -> None:
-        """Be the map that was remembered."""
-        self.number, self.submap, self.estimator.state = known.number, known.submap, known.state
-        self.landmarks = {slot: replace(one) for slot, one in known.landmarks.items()}
-        self.place = replace(known.place)
-        self.submaps, self.loops, self.earlier = known.submaps, known.loops, known.earlier
+    def with_map(self, **changes: object) -> TrackerState:
+        """The state with another map: this one, but for these of its fields."""
+        return replace(self, map=replace(self.map, **changes))
 
-    def come_back(self, known: Remembered, found: Remembered) -> None:
+    def points(self) -> Points:
+        """Return all landmarks, those gone included."""
+        return joined([*self.finished, self._recorded(sorted(self.landmarks))])
+
+    def noted(self, seen: Observations, predicted: Predicted | None = None) -> TrackerState:
+        """The state after what was found of the landmarks, where that was `predicted` by how much
+        it is off, without those that are searched in vain."""
+        landmarks, matched = dict(self.landmarks), seen.labelled("matched")
+        if predicted is not None and len(matched.slots):
+            innovations = self.estimator.each_given_others(predicted, matched)
+            for slot, innovation in zip(matched.slots.tolist(), innovations, strict=True):
+                landmarks[slot] = landmarks[slot].compared(innovation)
+        landmarks = note_found(landmarks, seen, self.estimator.settings)
+        vain = failing(landmarks, self.estimator.settings)
+        return self.with_map(landmarks=landmarks).given_up(vain)
+
+    def begun(
+        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> TrackerState:
+        """Landmarks at these pixels begin a map that has none; `depths` as `Estimator`'s."""
+        slots = self._free(len(pixels))
+        state, report = self.estimator.begin(self.map.state, slots, pixels, depths)
+        begun = self.with_map(state=state, place=self.map.place.begun(report))
+        return begun._with_new(slots, image, pixels)
+
+    def renewed(
+        self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS
+    ) -> TrackerState:
+        """The state at the end of the filter's frame, with new landmarks at these pixels, for which
+        others than those in the slots `kept` make room."""
+        now = self._with_room(len(pixels), kept)
+        slots = now._free(len(pixels))
+        state, report = self.estimator.renew(now.map.state, slots, pixels)
+        now = now.with_map(state=state)
+        if gone := [slot for slot in now.landmarks if not report.in_map[slot]]:
+            # No point of the world is seen there.
+            nowhere = np.full((len(gone), 3), np.nan), np.full((len(gone), 3, 3), np.nan)
+            now = now.given_up(gone, now._of(gone, *nowhere))
+        found = [one.number for one in now.landmarks.values() if one.found]
+        place = now.map.place.followed(report, now._nearness(), found)
+        now = now.with_map(place=place)._with_new(slots, image, pixels)
+        more = place.unit_fixed and now.seen is None and len(now.map.submaps) < MOST
+        return now._handed_over(image) if report.left and more else now
+
+    def _handed_over(self, image: Picture) -> TrackerState:
+        """The submap ends at the camera, where this picture was taken."""
+        landmarks = with_looks(self.landmarks, image)
+        settings, slam, map = self.estimator.settings, self.estimator.slam, self.map
+        numbers = slot_numbers(landmarks, settings.capacity)
+        ended, state = handed_over(slam, map.state, numbers, map.place.camera, number=map.submap)
+        number, submaps = self.latest_submap + 1, (*map.submaps, ended)
+        map = replace(map, state=state, landmarks=landmarks, submap=number, submaps=submaps)
+        count = len(submaps)
+        soon = min(count + count // 3 + 2, MOST)
+        in_background(compile_graph(slam, state, settings, soon))
+        return replace(
+            self,
+            map=replace(map, earlier=(*map.earlier, map)),
+            latest_submap=number,
+            charted={**self.charted, **{one.number: one for one in landmarks.values()}},
+        )
+
+    def restarted(self) -> TrackerState:
+        """The state without landmarks: another map begins where the camera is. One that was never
+        measured is none, and has its number."""
+        now = self._abandoned()
+        return now._begun_anew(now.map.place.restarted(), number=now.restarts + 1)
+
+    def departed(self) -> TrackerState:
+        """The state without landmarks: what comes next is in another world, unless it is known."""
+        return self.remembered().restarted().with_map(place=MapInWorld())
+
+    def remembered(self) -> TrackerState:
+        """The state in which the map is kept as it was in the frame before this one, in which the
+        camera is lost, to come back to it; not while a start is being found out, nor one that was
+        never measured."""
+        map = self.map
+        if self.seen is None and map.place.unit_fixed and map.number <= self.restarts:
+            return replace(self, seen=map)
+        return self
+
+    def come_back(self, known: Map, found: Map) -> TrackerState:
         """Leave this map for one that was `known`, as it is now that it is `found`.
 
         Where that is an earlier submap, the next one is of another branch than what came after it,
         which is kept as one more map that was left.
         """
-        latest = any(known is one for one in self.known())
-        if known is not self.seen:
-            self.give_up(sorted(self.landmarks))
-            self._keep()
-        self.left = [one for one in self.left if one is not known]
-        self.become(found)
-        if not latest:
-            self.earlier = (*known.earlier, known)
-            self._begin_submap()
-        self.seen = None
+        now = self if known is self.seen else self._abandoned()
+        left = tuple(one for one in now.left if one is not known)
+        if not any(known is one for one in self.known()):
+            number = now.latest_submap + 1
+            now = replace(now, latest_submap=number)
+            found = replace(found, earlier=(*known.earlier, known), submap=number)
         back = [one.number for one in found.landmarks.values()]
-        self.finished = [points.only(~np.isin(points.numbers, back)) for points in self.finished]
+        finished = tuple(points.only(~np.isin(points.numbers, back)) for points in now.finished)
+        return replace(now, map=found, left=left, seen=None, finished=finished)
 
-    def _begin_chain(self) -> None:
-        """Begin with nothing."""
-        self._begin_submap()
-        self.submaps, self.loops, self.earlier = (), (), ()
-        self.estimator.clear()
-
-    def fall_back(self, predicted: Predicted) -> None:
-        """Give up all landmarks and go on by what prediction alone says of the camera: the update
-        had a covariance that is not positive. The landmarks are those of the frame before."""
+    def fallen_back(self, predicted: Predicted) -> TrackerState:
+        """The state without landmarks by what prediction alone says of the camera: the update had a
+        covariance that is not positive. The landmarks are those of the frame before."""
         slots = sorted(self.landmarks)
         recorded = self._recorded(slots)
-        self.coast(predicted)
-        self.give_up(slots, recorded)
+        return self.coasted(predicted).given_up(slots, recorded)
 
-    def coast(self, predicted: Predicted) -> None:
-        """Go on without a measurement. Where that is broken too, the camera is as far from where it
-        was last as the prior on a start's velocity lets it be."""
-        if self.estimator.correct(predicted).failed:
-            self.place.restart()
-            self.place.log_unit = -self.place.log_scale  # its state is empty: in metres
-            self._begin_chain()
-            self.estimator.correct(self.estimator.predict(predicted.dt))
+    def coasted(self, predicted: Predicted) -> TrackerState:
+        """The state without a measurement; `anew` where that is broken too."""
+        state, correction = self.estimator.correct(predicted)
+        if correction.failed:
+            return self.anew(predicted.dt)
+        return self.with_map(state=state)
 
-    def give_up(self, slots: list[int], recorded: Points | None = None) -> None:
-        """Take landmarks out of the map, of which this is `recorded`."""
-        if slots:
-            self.finished.append(self._recorded(slots) if recorded is None else recorded)
-            for slot in slots:
-                del self.landmarks[slot]
-            self.estimator.remove(slots)
+    def anew(self, seconds: Float[np.ndarray, ""]) -> TrackerState:
+        """The state with an empty filter: the camera is as far from where it was so many seconds
+        ago as the prior on a start's velocity lets it be."""
+        place = self.map.place.restarted()
+        place = replace(place, log_unit=-place.log_scale)  # an empty state is in metres
+        now = self._begun_anew(place, number=self.map.number)
+        state, correction = self.estimator.correct(self.estimator.predict(now.map.state, seconds))
+        return now if correction.failed else now.with_map(state=state)
 
-    def measure_unit(self) -> None:
-        """Note how near the landmarks are now, by which the next frame's unit is found."""
-        self.place.near = self._nearness()
+    def given_up(self, slots: list[int], recorded: Points | None = None) -> TrackerState:
+        """The state without the landmarks in these slots, of which this is `recorded`."""
+        if not slots:
+            return self
+        gone = self._recorded(slots) if recorded is None else recorded
+        landmarks = {slot: one for slot, one in self.landmarks.items() if slot not in slots}
+        state = self.estimator.remove(self.map.state, slots)
+        map = replace(self.map, state=state, landmarks=landmarks)
+        return replace(self, map=map, finished=(*self.finished, gone))
 
-    def _make_room(self, count: int, kept: Int[np.ndarray, " n"]) -> None:
+    def _abandoned(self) -> TrackerState:
+        """The state without landmarks, and with the map as it was seen last among those left."""
+        left = (*self.left, *([] if self.seen is None else [self.seen]))[-KEPT:]
+        return replace(self.given_up(sorted(self.landmarks)), left=left, seen=None)
+
+    def _begun_anew(self, place: MapInWorld, number: int) -> TrackerState:
+        """A map of this number with the landmarks that there are, and nothing else."""
+        submap = self.latest_submap + 1
+        map = Map(self.estimator.empty(), place, self.landmarks, number, submap)
+        return replace(self, map=map, latest_submap=submap)
+
+    def _with_room(self, count: int, kept: Int[np.ndarray, " n"]) -> TrackerState:
         """Give up landmarks, except those `kept`, until there are slots for so many new ones."""
-        missing = count + len(self.landmarks) - self.settings.capacity
+        missing = count + len(self.landmarks) - self.estimator.settings.capacity
         if missing <= 0:
-            return
+            return self
         slots = np.setdiff1d(list(self.landmarks), kept)
         points = self._recorded(slots.tolist())
-        worst = worst_first([self.landmarks[slot] for slot in slots], points, self.settings)
-        self.give_up(slots[worst[:missing]].tolist(), points.only(worst[:missing]))
+        some = [self.landmarks[slot] for slot in slots.tolist()]
+        worst = worst_first(some, points, self.estimator.settings)[:missing]
+        return self.given_up(slots[worst].tolist(), points.only(worst))
 
     def _free(self, count: int) -> Int[np.ndarray, " n"]:
         """The first free slots."""
-        free = [slot for slot in range(self.settings.capacity) if slot not in self.landmarks]
-        return np.array(free[:count], int)
+        slots = range(self.estimator.settings.capacity)
+        return np.array([slot for slot in slots if slot not in self.landmarks][:count], int)
 
-    def _add(self, slots: Slots, image: Picture, pixels: Pixels) -> None:
-        first, camera = self.created, self.place.camera.T_wc
+    def _with_new(self, slots: Slots, image: Picture, pixels: Pixels) -> TrackerState:
+        """The state with landmarks in these slots, and how near all are, by which the next frame's
+        unit is found."""
+        first, camera = self.created, self.map.place.camera.T_wc
+        landmarks = dict(self.landmarks)
         for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
-            self.landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
-        self.measure_unit()
+            landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
+        now = self.with_map(landmarks=landmarks)
+        return now.with_map(place=replace(now.map.place, near=now._nearness()))
 
     def _nearness(self) -> Nearness:
         """Return the nearness of all landmarks, as long as the filter's unit is not fixed."""
-        if self.place.unit_fixed:
+        if self.map.place.unit_fixed:
             return {}
         numbers = {slot: one.number for slot, one in self.landmarks.items()}
-        return nearness(numbers, self.estimator.points()[0])
-
-    def _nowhere(self, slots: list[int]) -> Points:
-        """Landmarks that the filter gave up, since no point of the world is seen there."""
-        n = len(slots)
-        return self._of(slots, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan))
+        return nearness(numbers, self.estimator.points(self.map.state)[0])
 
     def _recorded(self, slots: list[int]) -> Points:
-        return self._of(slots, *(part[slots] for part in self.estimator.points()))
+        return self._of(slots, *(part[slots] for part in self.estimator.points(self.map.state)))
 
     def _of(self, slots: list[int], points: np.ndarray, covariances: np.ndarray) -> Points:
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
-        maps = np.full_like(numbers, self.number)
-        submaps = np.full_like(numbers, self.submap)
-        return Points(numbers, maps, submaps, *self.place.points(points, covariances))
+        maps = np.full_like(numbers, self.map.number)
+        submaps = np.full_like(numbers, self.map.submap)
+        return Points(numbers, maps, submaps, *self.map.place.points(points, covariances))
 
 
 def slot_numbers(landmarks: Mapping[int, Landmark], capacity: int) -> Int[np.ndarray, " slots"]:
@@ -349,16 +373,16 @@ def in_view(
 
 def note_found(
     landmarks: Mapping[int, Landmark], seen: Observations, settings: TrackerSettings
-) -> None:
-    """Note which of the landmarks searched were matched, and where.
+) -> dict[int, Landmark]:
+    """Return the landmarks after a search, that matched some of them.
 
     That nothing at all was found is the camera's failure, and held against no landmark.
     """
-    for landmark in landmarks.values():
-        landmark.unseen += 1
+    noted = {slot: replace(one, unseen=one.unseen + 1) for slot, one in landmarks.items()}
     if seen.matched.any():
-        for slot, ok, pixel in zip(seen.slots, seen.matched, seen.pixels, strict=True):
-            landmarks[slot].searched(bool(ok), pixel, settings.patience)
+        for slot, ok, pixel in zip(seen.slots.tolist(), seen.matched, seen.pixels, strict=True):
+            noted[slot] = noted[slot].searched(bool(ok), pixel, settings.patience)
+    return noted
 
 
 def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> list[int]:

@@ -98,7 +98,8 @@ def match_patches(
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    chosen = _alone(peaks.only(~in_wide), ambiguity).joined(_several(peaks.only(in_wide)))
+    both = _alone(peaks.only(~in_wide), ambiguity), _several(peaks.only(in_wide))
+    chosen = _Peaks(*map(np.concatenate, zip(*both, strict=True)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
@@ -280,9 +281,6 @@ class _Peaks(NamedTuple):
 
     def only(self, which: np.ndarray) -> "_Peaks":
         return _Peaks(*(part[which] for part in self))
-
-    def joined(self, others: "_Peaks") -> "_Peaks":
-        return _Peaks(*map(np.concatenate, zip(self, others, strict=True)))
 
 
 def _peaks(image: Grey, templates: Windows, boxes: _Boxes, least: float) -> _Peaks:

@@ -27,6 +27,8 @@ class Lost(StrEnum):
     """The filter used none of the matches."""
     NOT_POSITIVE = "not positive"
     """The update's covariance was not positive."""
+    NOT_FINITE = "not finite"
+    """What the filter makes of the frame is no number."""
     REVERSED = "reversed"
     """Most of the map turned out to be behind the camera."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.files import write_atomically
+from jaxslam._runtime.files import write_text
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.patches import Places
 from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
@@ -56,8 +56,7 @@ def write_ply(
         " ".join(f"{value:.9g}" for value in row) + f" {number} {map_number}"
         for row, number, map_number in zip(table, ids, maps, strict=True)
     ]
-    with write_atomically(path) as temporary:
-        temporary.write_text("\n".join(header + rows) + "\n", encoding="ascii")
+    write_text(path, "\n".join(header + rows) + "\n")
 
 
 class Cloud(NamedTuple):

@@ -14,9 +14,9 @@ from scipy.stats import binom, chi2
 from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ransac
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
-from jaxslam.tracking.estimator import Predicted
+from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark
-from jaxslam.tracking.map import Map
+from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
 from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
 from jaxslam.tracking.patches import Picture
@@ -51,7 +51,7 @@ Surprise = Callable[[Observations], tuple[float, int]]
 """NIS of what was seen and its degrees of freedom, `Estimator.nis` of one prediction."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Policy:
     """Decides which matches of each frame of a map are believed."""
 
@@ -59,12 +59,11 @@ class Policy:
     settings: TrackerSettings
     ambiguous_start: bool
     """Whether the filter welcomes matches of a start that no linear prediction expects."""
-    doubtful: bool = False
-    """Whether two motions of the camera were as likely when there were matches last."""
 
-    def forget(self) -> None:
-        """Begin with a new map."""
-        self.doubtful = False
+    @classmethod
+    def of(cls, calibration: Calibration, estimator: Estimator) -> Policy:
+        """That of a filter and its settings."""
+        return cls(calibration, estimator.settings, estimator.slam.ambiguous_start)
 
     @property
     def in_wide(self) -> list[Association]:
@@ -74,32 +73,34 @@ class Policy:
         return list(dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association])))
 
     def observed(
-        self, image: Picture, map: Map, predicted: Predicted, *, lost: bool
-    ) -> tuple[Observations, Lost | None]:
+        self, image: Picture, state: TrackerState, predicted: Predicted, *, lost: bool
+    ) -> tuple[Observations, Lost | None, bool]:
         """The landmarks that a picture is searched for, and which matches of them are believed; or
-        why none are. What was known before the search is what the table says of each."""
+        why none are; and whether another motion is as likely. What was known before the search is
+        what the table says of each."""
+        map, estimator, doubtful = state.map, state.estimator, state.doubtful
         expected = map.place.expected(predicted.view)
         look = partial(search, image, map.landmarks)
         # One linear update from matches that no linear prediction expects would be wrong, and sure.
         searched = look(expected, self.calibration, self.settings, several=self.ambiguous_start)
-        agree = partial(map.estimator.believes, predicted)
+        agree = partial(estimator.believes, predicted)
         seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
         if seen.matched.any() and _sigma(seen.covariances) > WIDE:
-            given = map.estimator.given(predicted, seen.labelled("matched"))
+            given = estimator.given(predicted, seen.labelled("matched"))
             closer = self._closer(seen, map.place.expected(given))
             if _explained(seen, closer):
                 searched = look(closer, self.calibration, self.settings, several=False)
                 again = self.agreeing(*searched, map.landmarks, agree, lost=lost)
                 seen = again if again.matched.any() else seen
-        nis = partial(map.estimator.nis, predicted)
+        nis = partial(estimator.nis, predicted)
         if not self._likely_given_proven(seen, map.landmarks, nis):
             of_proven = partial(_of_proven, map.landmarks, agree)
             seen = self.agreeing(*searched, map.landmarks, of_proven, lost=lost)
-        reason = self.reason(seen, map.landmarks, agree, nis)
+        reason, doubtful = self.reason(seen, map.landmarks, agree, nis, doubtful=doubtful)
         if reason is not None:
             seen = seen._replace(labels=np.where(seen.matched, "outlier", seen.labels))
         prior = expected.pixels[seen.slots], expected.covariances[seen.slots]
-        return seen._replace(predicted=prior[0], covariances=prior[1]), reason
+        return seen._replace(predicted=prior[0], covariances=prior[1]), reason, doubtful
 
     def agreeing(
         self,
@@ -153,19 +154,27 @@ class Policy:
         return not asked or bool(chi2.sf(whole - old, dof - known) > TOGETHER)
 
     def reason(
-        self, seen: Observations, landmarks: Mapping[int, Landmark], agree: Agreement, nis: Surprise
-    ) -> Lost | None:
-        """Return why nothing of a table is believed, if so."""
+        self,
+        seen: Observations,
+        landmarks: Mapping[int, Landmark],
+        agree: Agreement,
+        nis: Surprise,
+        *,
+        doubtful: bool = False,
+    ) -> tuple[Lost | None, bool]:
+        """Return why nothing of a table is believed, if so, and whether another motion is as
+        likely, which it may have been before (`doubtful`)."""
         if not len(seen.slots):
-            return Lost.NOTHING_EXPECTED
+            return Lost.NOTHING_EXPECTED, doubtful
         if not seen.matched.any():
-            return Lost.FEW_AGREE
+            return Lost.FEW_AGREE, doubtful
         known = seen.only(proven(seen.slots, landmarks))
         agreed = known.labelled("matched")
         few = len(agreed.slots) <= MOST * len(known.slots)
         another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
-        self.doubtful = another or (self.doubtful and few)
-        return Lost.CONTRADICTED if self.doubtful or (chi2.sf(*nis(agreed)) < BY_CHANCE) else None
+        doubtful = another or (doubtful and few)
+        wrong = doubtful or chi2.sf(*nis(agreed)) < BY_CHANCE
+        return Lost.CONTRADICTED if wrong else None, doubtful
 
     def _another(self, others: Observations, agreed: int, agree: Agreement) -> bool:
         """Return whether most of these, and many beside those that `agreed`, do so with another

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._runtime.files import write_atomically
+from jaxslam._runtime.files import append_whole, write_text
 from jaxslam.io.source import Frame
+from jaxslam.io.tum import tum_text
+from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
-
-_COLUMNS = (
-    "frame", "time", "state", "map", "matches", "nis", "nis_dof",
-    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason",
-    "relocalised", "submap", "loop",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,6 +47,8 @@ class Tracked:
     """Whether the camera, which was lost, is known to be back in a map that it had seen before."""
     loop: int | None = None
     """Number of the submap whose landmarks the frame shows again, where that closes a loop."""
+    repeated: bool = False
+    """Whether the picture is the one before once more: it says nothing new, and is not used."""
     submap: int = 0
     """Number of the submap, among those of all maps."""
     map: int = 0
@@ -66,10 +65,19 @@ class Tracked:
     and the map's is carried over by the landmarks' distances, about which no covariance knows."""
 
     @classmethod
-    def of(cls, frame: Frame, map: Map, observations: Observations = NOTHING, **found) -> Tracked:
+    def of(
+        cls,
+        frame: Frame,
+        map: Map,
+        observations: Observations = NOTHING,
+        correction: Correction | None = None,
+        **found,
+    ) -> Tracked:
         """Return what became of a frame, after which the map is this one; `found` are other
         fields."""
         place, doubt = map.place, map.place.sigma_log_scale
+        if correction is not None:
+            found |= {"nis": float(correction.nis), "nis_dof": int(correction.nis_dof)}
         return cls(
             frame.index,
             frame.time,
@@ -120,8 +128,16 @@ class Tracked:
         return "start" if self.starts else "lost" if self.lost else "tracked"
 
 
-def write_frames(path: str | Path, history: list[Tracked]) -> None:
-    """Write what became of every frame as CSV, whole or not at all.
+def trajectory_text(history: Sequence[Tracked]) -> str:
+    """The poses of all frames in TUM format. All of a map are in one unit of length
+    (docs/gauge.md), and the header says so."""
+    poses = np.stack([result.T_wc for result in history])
+    times = [result.time for result in history]
+    return tum_text(times, poses, "in the unit of each map (frames.csv)")
+
+
+def frames_text(history: Sequence[Tracked]) -> str:
+    """What became of every frame, as CSV.
 
     `state` is `start` of a map (lost too, unless it is the first), `tracked` or `lost`. `map` is
     the number of the map, from 0. σ of position (map units) and orientation (rad) are roots of the
@@ -132,31 +148,53 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
     camera that was lost is known to be back in a map that it had seen, whose number it then is.
     `submap` is the number of the submap, from 0 through all maps, and `loop` that of an earlier one
-    of the map that is known again at this frame.
+    of the map that is known again at this frame. `repeated` is 1 where the picture is the one
+    before once more: its pose is that of this picture, and nothing was learnt from it.
     """
-    with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(_row(result) for result in history)
+    file = io.StringIO()
+    rows = [_row(result) for result in history]
+    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
 
 
-def _row(result: Tracked) -> list[object]:
+TEXTS = {"trajectory.txt": trajectory_text, "frames.csv": frames_text}
+"""Files that grow with every frame."""
+
+
+def add_latest(out: Path, history: Sequence[Tracked]) -> None:
+    """Add the latest frame to the files in a folder, which are whole at any time; an interruption
+    of the first two leaves none."""
+    for name, text in TEXTS.items():
+        if len(history) > 2:
+            append_whole(out / name, text(history[-1:]).splitlines(keepends=True)[-1])
+        elif len(history) == 2:
+            write_text(out / name, text(history))
+
+
+def _row(result: Tracked) -> dict[str, object]:
     camera = result.camera
-    numbers = (
-        camera.sigma_position, camera.sigma_orientation, result.sigma_log_scale, result.log_scale,
-    )  # fmt: skip
-    return [
-        result.index,
-        f"{result.time:.9f}",
-        result.state,
-        result.map,
-        result.status.count("matched"),
-        f"{result.nis:.6g}",
-        result.nis_dof,
-        *("" if number is None else f"{number:.6g}" for number in numbers),
-        int(result.unit_fixed),
-        result.reason or "",
-        int(result.relocalised),
-        result.submap,
-        "" if result.loop is None else result.loop,
-    ]
+
+    def short(number: float | None) -> str:
+        return "" if number is None else f"{number:.6g}"
+
+    return {
+        "frame": result.index,
+        "time": f"{result.time:.9f}",
+        "state": result.state,
+        "map": result.map,
+        "matches": result.status.count("matched"),
+        "nis": short(result.nis),
+        "nis_dof": result.nis_dof,
+        "sigma_position": short(camera.sigma_position),
+        "sigma_orientation": short(camera.sigma_orientation),
+        "sigma_log_scale": short(result.sigma_log_scale),
+        "log_scale": short(result.log_scale),
+        "unit_fixed": int(result.unit_fixed),
+        "reason": result.reason or "",
+        "relocalised": int(result.relocalised),
+        "submap": result.submap,
+        "loop": "" if result.loop is None else result.loop,
+        "repeated": int(result.repeated),
+    }

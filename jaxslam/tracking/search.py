@@ -39,9 +39,8 @@ def search(
         np.zeros(len(slots)),
         np.full(len(slots), "unmatched"),
     )
-    warped = [
-        landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
-    ]
+    pairs = zip(slots, affines, strict=True)
+    warped = [landmarks[slot].patch.warped(affine) for slot, affine in pairs]
     templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
     return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.slam import Slam
-from jaxslam.io.calibration import Calibration
 from jaxslam.models.frame import Robocentric, Submaps
-from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.patches import Places
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
+from jaxslam.tracking.target import Target, TargetObservation, known_depths
 
 
 def trackable(
@@ -50,18 +49,13 @@ def _handing_over(made: AbstractStaged) -> AbstractStaged:
         return made
 
 
-def with_target(
-    target: Target,
-    image: Picture,
-    corners: Places,
-    calibration: Calibration,
-    settings: TrackerSettings,
-) -> tuple[TargetObservation, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return where a picture shows a target; pixels to start landmarks at, of its points first and
-    of the corners away from them; and mean and σ of 1/z of as many as are wanted."""
+def places_with_target(
+    seen: TargetObservation, corners: Places, settings: TrackerSettings
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return pixels to start landmarks at, of a target's points first and of the corners away from
+    them; and mean and σ of 1/z of as many as are wanted."""
     s = settings
-    seen = sighted(target, image, calibration, s.pixel_sigma)
     distances = np.linalg.norm(corners[:, None] - seen.pixels, axis=2)
     apart = corners[np.all(distances >= s.spacing, axis=1)]
     pixels = np.concatenate([seen.pixels, apart])[: s.wanted]
-    return seen, pixels, known_depths(seen, s.wanted, float(s.depth.mean), float(s.depth.sigma))
+    return pixels, known_depths(seen, s.wanted, float(s.depth.mean), float(s.depth.sigma))

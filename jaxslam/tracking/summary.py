@@ -50,7 +50,7 @@ def summarised(
 ) -> Summary:
     """Summarise the frames, and the landmarks as they are known at the end."""
     lost = sum(result.lost for result in history)
-    updates = history[1:]
+    updates = [result for result in history[1:] if not result.repeated]
     dof = sum(result.nis_dof for result in updates)
     count = max(len(updates), 1)
     later = seconds[WARM_UP:] or seconds or [0.0]
@@ -66,7 +66,8 @@ def summarised(
         "lost": lost,
         "lost_reasons": dict(Counter(result.reason for result in history if result.reason)),
         "restarts": tracker.restarts,
-        "maps": max(1, len({result.map for result in history if result.starts or not result.lost})),
+        "repeated": sum(result.repeated for result in history),
+        "maps": max(1, len({result.map for result in history if not result.lost})),
         "relocalised": sum(result.relocalised for result in history),
         "submaps": len({result.submap for result in history}),
         "loops": sum(result.loop is not None for result in history),
@@ -119,6 +120,11 @@ def describe(summary: Summary) -> str:
         reasons = (f"{count} {reason}" for reason, count in summary["lost_reasons"].items())
         frames = "1 frame" if summary["lost"] == 1 else f"{summary['lost']} frames"
         lines.append(f"{frames} lost: {', '.join(reasons)}")
+    if summary["repeated"]:
+        lines.append(
+            f"{summary['repeated']} pictures repeat the one before and were not used: is the rate "
+            "of the video higher than the camera's?"
+        )
     if summary["relocalised"]:
         times = "once" if summary["relocalised"] == 1 else f"{summary['relocalised']} times"
         lines.append(f"relocalised {times} in an earlier map")
@@ -217,7 +223,7 @@ def _units(history: Sequence[Tracked]) -> list[Summary]:
     """Return, for every map, the frame from which on the filter's unit was fixed, and the log of
     the map's unit in metres as believed at its end, with σ; null where there is no doubt."""
     units = []
-    for number in range(history[-1].map + 1):
+    for number in sorted({result.map for result in history}):
         of_map = [result for result in history if result.map == number]
         fixed = (result.index for result in of_map if result.unit_fixed)
         last = of_map[-1]

@@ -4,7 +4,6 @@ MonoSLAM's start (Davison, Reid, Molton, Stasse, PAMI 2007): a picture of known 
 """
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -127,7 +126,7 @@ def sighted(
     that the target fits best from some pose. Raises ValueError where it is not in the picture.
     """
     combined = map(np.array, itertools.product(*_places(target, image)))
-    lens = _Lens(calibration.matrix, np.array(calibration.distortion))
+    lens = calibration.matrix, np.array(calibration.distortion)
     positions = target.positions
     pixels = min(combined, key=lambda pixels: _pose(positions, pixels, lens).rms)
     pixels = _on_corners(target, image, pixels)
@@ -175,9 +174,8 @@ def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:
     return np.where(found[:, None], corners.astype(float), pixels)
 
 
-class _Lens(NamedTuple):
-    matrix: Float[np.ndarray, "3 3"]
-    distortion: Float[np.ndarray, " 5"]
+_Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " distortion"]]
+"""Intrinsics and distortion, as OpenCV takes them."""
 
 
 class _Pose(NamedTuple):
@@ -242,9 +240,8 @@ def known_depths(
 def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Json]:
     """Return an entry of summary.json: lengths in metres, the target's frame in the first
     camera."""
-    names: Sequence[str] = [point.name for point in target.points]
     return {
-        "points": names,
+        "points": [point.name for point in target.points],
         "pixels": sighting.pixels.tolist(),
         "depths": (1 / sighting.inverse_depths).tolist(),
         "reprojection_rms": sighting.rms,

@@ -1,15 +1,20 @@
-"""The tracker: a filter fed with pictures, frame by frame, by active search."""
+"""The tracker: a filter fed with pictures, frame by frame, by active search.
+
+It is a fold: `step` takes a `TrackerState` and a frame to the next state.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import jax
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.calibration import Calibration
@@ -19,19 +24,216 @@ from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
 from jaxslam.tracking.estimator import Correction, Estimator
-from jaxslam.tracking.landmarks import Landmark, Points
-from jaxslam.tracking.map import Map, in_view
+from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.map import Map, TrackerState, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.patches import Pixels, Places
 from jaxslam.tracking.places.closing import close_loop
-from jaxslam.tracking.places.descriptors import note_looks
-from jaxslam.tracking.places.joining import LOOKED_EVERY, Join, join_of, joined, known_elsewhere
+from jaxslam.tracking.places.descriptors import with_looks
+from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
+from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.start import trackable, with_target
-from jaxslam.tracking.target import Target, TargetObservation
+from jaxslam.tracking.start import places_with_target, trackable
+from jaxslam.tracking.target import Target, TargetObservation, sighted
+
+SAME, NEARLY = 0.5, 0.1
+"""RMS of the difference of two pictures that are one: grey levels, and the share of what a picture
+changed before. A camera's own noise is more; what a film's compression leaves of it is less."""
+MOST_REPEATS = 3
+"""Pictures in a row that are taken for one which a film has several times."""
+Stepped = tuple[TrackerState, Tracked]
+"""The state after a frame, and what became of the frame."""
+
+
+def start(
+    slam: AbstractStaged, settings: TrackerSettings, calibration: Calibration
+) -> TrackerState:
+    """The state before the first frame of a camera with this calibration."""
+    with jax.enable_x64(True):
+        estimator = Estimator.of(slam, settings)
+        return TrackerState(estimator, calibration, Map(estimator.empty()))
+
+
+def step(
+    slam: AbstractStaged,
+    settings: TrackerSettings,
+    state: TrackerState,
+    frame: Frame,
+    sighting: TargetObservation | None = None,
+) -> Stepped:
+    """Predict, search, update, and renew the map; the first frame may have a `sighting` of points
+    that are known.
+
+    A frame after which the camera's pose is not finite is lost: the tracker goes on from the state
+    before it. A picture that is the one before once more is not used. Raises ValueError for a frame
+    of another size than the calibration's, or not later than the one before.
+    """
+    check_size(f"frame {frame.index}", frame.image, state.calibration)
+    before = -np.inf if state.time is None else state.time
+    if not before < frame.time < np.inf:
+        raise ValueError(
+            f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
+            f"previous frame, {before} s"
+        )
+    waited = 0.0 if state.time is None else frame.time - state.time + state.waiting
+    apart, known = _apart(state.image, frame.image), state.landmarks and not state.unmeasured
+    if known and apart <= max(SAME, NEARLY * state.apart):
+        # The camera is where this picture was taken. What comes after few such pictures has their
+        # time too; after many the camera, or the picture, stood still.
+        waiting = waited if state.repeats < MOST_REPEATS else 0.0
+        after = replace(state, repeats=state.repeats + 1, waiting=waiting)
+        tracked = Tracked.of(frame, state.map, repeated=True)
+    else:
+        with jax.enable_x64(True):
+            state = replace(state, estimator=Estimator.of(slam, settings))
+            try:
+                after, tracked = _taken(state, frame, waited, sighting)
+            except (FloatingPointError, LinAlgError):
+                after, tracked = _broken(state, frame, waited)
+        image, apart = frame.image.copy(), apart if np.isfinite(apart) else 0.0
+        after = replace(after, image=image, apart=apart, repeats=0, waiting=0.0)
+    return replace(after, time=frame.time, steps=state.steps + 1), tracked
+
+
+def _apart(one: np.ndarray | None, other: np.ndarray) -> float:
+    """RMS of the difference of two pictures, grey levels."""
+    return np.inf if one is None else cv2.norm(one, other, cv2.NORM_L2) / math.sqrt(other.size)
+
+
+def _taken(
+    state: TrackerState, frame: Frame, seconds: float, sighting: TargetObservation | None
+) -> Stepped:
+    """The frame, so many seconds after the latest one that was used."""
+    policy = Policy.of(state.calibration, state.estimator)
+    if state.time is None:
+        state.estimator.compile(policy.in_wide)
+    if state.searching:
+        return _searching(state, frame, policy)
+    if state.time is not None:
+        return _next(state, frame, policy, seconds)
+    pixels, depths = _corners(state, frame), None
+    if sighting is not None:
+        pixels, depths = places_with_target(sighting, pixels, state.estimator.settings)
+    state = state.begun(frame.image, pixels, depths)
+    return state, Tracked.of(frame, state.map, created=pixels, starts=True)
+
+
+def _broken(state: TrackerState, frame: Frame, seconds: float) -> Stepped:
+    """A frame that leads to numbers which are not finite: a new map where the camera was."""
+    state = _with_failure(state, "not_finite").remembered()
+    state = replace(state, unmeasured=state.unmeasured + 1)
+    try:
+        begun = state.given_up(sorted(state.landmarks)).anew(np.asarray(seconds))
+        return _lost(begun, frame, Lost.NOT_FINITE)
+    except (FloatingPointError, LinAlgError):
+        return state, Tracked.of(frame, state.map, reason=Lost.NOT_FINITE)
+
+
+def _corners(state: TrackerState, frame: Frame, occupied: Pixels | None = None) -> Places:
+    return bare_corners(frame.image, state.estimator.settings, occupied)
+
+
+def _searching(state: TrackerState, frame: Frame, policy: Policy) -> Stepped:
+    """Look for a map that is known; begin another where there was none for long."""
+    found = known_again(frame.image, policy, state)
+    if found is not None:
+        return _back(frame, *found)
+    state, corners = replace(state, unmeasured=state.unmeasured + 1), _corners(state, frame)
+    if state.unmeasured <= state.estimator.settings.lost_for or len(corners) < LEAST_MATCHES:
+        return state, Tracked.of(frame, state.map, reason=Lost.NOTHING_EXPECTED)
+    state = replace(state, unmeasured=0, searching=False).begun(frame.image, corners)
+    return state, Tracked.of(frame, state.map, created=corners, starts=True)
+
+
+def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> Stepped:
+    """Track a frame so many seconds after the one before."""
+    estimator, lost = state.estimator, state.unmeasured > 0
+    predicted = estimator.predict(state.map.state, seconds)
+    ahead, behind = predicted.view.sides
+    if behind > ahead and behind >= LEAST_MATCHES:
+        # Nobody is to come back to it.
+        state = replace(state, reversed=state.reversed + 1, seen=None)
+        return _lost(state.coasted(predicted), frame, Lost.REVERSED)
+    seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
+    # Of two motions that contradict each other a place that is known says no more: it is one of
+    # both.
+    elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
+    state = replace(state, doubtful=doubtful, elsewhere=elsewhere and reason is not None)
+    if reason is not None:
+        state = state.remembered()
+    if state.elsewhere and lost:
+        found = known_again(frame.image, policy, state)
+        if found is not None:
+            return _back(frame, *found)
+    seen = state.map.weighed(seen, estimator.settings)
+    belief, correction = estimator.correct(predicted, seen)
+    if correction.failed:
+        state = _with_failure(state, Status(int(correction.status)).name.lower())
+        return _lost(state.remembered().fallen_back(predicted), frame, Lost.NOT_POSITIVE)
+    seen = seen.but_for(correction.used)
+    after = state.with_map(state=belief).noted(seen, predicted)
+    after = replace(after, seen=None if reason is None else after.seen)
+    if reason is None and not seen.matched.any():
+        reason = Lost.REFUSED
+    kept = in_view(after.landmarks, seen.slots, estimator.settings)
+    if reason is None:
+        after = replace(after, unmeasured=0, restarts=max(after.restarts, after.map.number))
+    else:
+        after = replace(after, unmeasured=after.unmeasured + 1)
+    if not after.landmarks or after.unmeasured > estimator.settings.lost_for:
+        return _lost(after, frame, reason or Lost.NOTHING_EXPECTED, seen)
+    # What a lost camera sees may be another place: it is not put into this map.
+    created = np.zeros((0, 2)) if reason else _corners(after, frame, seen.places[kept])
+    after = after.renewed(frame.image, created, seen.slots[kept])
+    loop = None
+    if reason is None and state.steps % LOOKED_EVERY == 0:
+        found = known_elsewhere(frame.image, policy, after)
+        if found is not None:
+            return _joined(frame, state.map.place.camera.T_wc, *found)
+    if len(after.map.submaps) > len(state.map.submaps):
+        after, loop = close_loop(frame.image, after)
+    if reason is None and state.steps % NOTED_EVERY == 0:
+        after = after.with_map(landmarks=with_looks(after.landmarks, frame.image))
+    outcome = {"created": created, "reason": reason, "loop": loop}
+    return after, Tracked.of(frame, after.map, seen, correction, **outcome)
+
+
+def _joined(
+    frame: Frame, last: Transform, state: TrackerState, seen: Observations, correction: Correction
+) -> Stepped:
+    """Go on in another map, which this one is joined to; `last` is T of the camera before."""
+    before = state.left[-1]
+    state, tracked = _back(frame, state, seen, correction)
+    join = join_of(before, state, last)
+    return replace(state, joins=state.joins + (() if join is None else (join,))), tracked
+
+
+def _back(frame: Frame, state: TrackerState, seen: Observations, correction: Correction) -> Stepped:
+    """Go on in a map in which the camera was found again."""
+    state = state.noted(seen).renewed(frame.image, np.zeros((0, 2)))
+    state = state.with_map(state=state.estimator.at_rest(state.map.state))
+    state = replace(state, unmeasured=0, searching=False, doubtful=False)
+    return state, Tracked.of(frame, state.map, seen, correction, relocalised=True)
+
+
+def _lost(state: TrackerState, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Stepped:
+    """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
+    corners, number = _corners(state, frame), state.map.number
+    state = state.renewed(frame.image, corners[:0])
+    if len(corners) < LEAST_MATCHES:
+        return state, Tracked.of(frame, state.map, seen, reason=reason)
+    state = replace(state.restarted(), unmeasured=0, doubtful=False).begun(frame.image, corners)
+    starts = state.map.number != number
+    return state, Tracked.of(frame, state.map, seen, created=corners, reason=reason, starts=starts)
+
+
+def _with_failure(state: TrackerState, name: str) -> TrackerState:
+    """One more update that failed so."""
+    return replace(state, failed={**state.failed, name: state.failed.get(name, 0) + 1})
 
 
 @dataclass
@@ -44,9 +246,9 @@ class Tracker:
     length is another, which no covariance here knows of. Within a map there is one unit, whatever
     the filter makes of the scale meanwhile (docs/gauge.md).
 
-    The mutable part is this object and its pieces; all mathematics is in pure, jitted functions of
-    the filter's state. Raises ValueError for a filter that cannot track, or cannot begin with the
-    target.
+    It holds the `state` that `jaxslam.tracking.tracker.step` goes on from, and what that knows it
+    has too: `steps`, `created`, `deleted`, `landmarks`, `restarts` and the others. Raises
+    ValueError for a filter that cannot track, or cannot begin with the target.
     """
 
     calibration: Calibration
@@ -61,28 +263,8 @@ class Tracker:
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
     """The name in the settings, or the class of your own filter."""
-    time: float | None = field(default=None, init=False)
-    """The time of the latest frame, s."""
-    steps: int = field(default=0, init=False)
-    """Frames given so far."""
-    unmeasured: int = field(default=0, init=False)
-    """The latest of them, in a row, in which no landmark was measured."""
-    elsewhere: bool = field(default=False, init=False)
-    """Whether the map was out of view in one of them."""
-    searching: bool = field(default=False, init=False)
-    """Whether no map has started because a known one may be found."""
-    failed: Counter[str] = field(default_factory=Counter, init=False)
-    """How many updates ended in which `Status` that says that their result means nothing."""
-    refused: int = field(default=0, init=False)
-    """Places that looked like earlier ones, and that cannot be these."""
-    reversed: int = field(default=0, init=False)
-    """Maps that turned out to lie behind the camera, and were given up."""
-    joins: tuple[Join, ...] = field(default=(), init=False)
-    """Maps that turned out to be of one world."""
-    map: Map = field(init=False, repr=False)
-    """Its landmarks and where it is in the world."""
-    policy: Policy = field(init=False, repr=False)
-    """Which matches are believed."""
+    state: TrackerState = field(init=False, repr=False)
+    """All that is known after the latest frame."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.calibration, Calibration):
@@ -94,44 +276,24 @@ class Tracker:
         self.filter_name = settings.filter if own is None else type(own).__name__
         made = settings.make_filter(self.calibration) if own is None else own
         made = trackable(self.filter_name, made, settings, self.target)
-        self.policy = Policy(self.calibration, settings, made.ambiguous_start)
-        with jax.enable_x64(True):
-            self.map = Map(settings, Estimator(made, settings))
+        self.state = start(made, settings, self.calibration)
 
-    @property
-    def landmarks(self) -> dict[int, Landmark]:
-        """The landmarks in the map, by their slot of the filter's state."""
-        return self.map.landmarks
-
-    @property
-    def created(self) -> int:
-        """The number of landmarks so far."""
-        return self.map.created
-
-    @property
-    def deleted(self) -> int:
-        """The number of landmarks that were given up."""
-        return self.map.deleted
-
-    @property
-    def restarts(self) -> int:
-        """The number of maps initialised after the first."""
-        return self.map.latest
+    def __getattr__(self, name: str):
+        """What the state says."""
+        if name == "state":  # not made yet
+            raise AttributeError(name)
+        return getattr(self.state, name)
 
     def track(self, frame: Frame) -> Tracked:
         """Predict, search, update, and renew the map. Raises ValueError, and changes nothing, for
         a frame of another size than the calibration's, or not later than the one before."""
-        check_size(f"frame {frame.index}", frame.image, self.calibration)
-        before = -np.inf if self.time is None else self.time
-        if not before < frame.time < np.inf:
-            raise ValueError(
-                f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
-                f"previous frame, {before} s"
+        sighting = None
+        if self.target is not None and self.state.time is None:
+            sighting = sighted(
+                self.target, frame.image, self.calibration, self.settings.pixel_sigma
             )
-        with jax.enable_x64(True):
-            tracked = self._first(frame) if self.time is None else self._next(frame, self.time)
-        self.time = frame.time
-        self.steps += 1
+        self.state, tracked = step(self.estimator.slam, self.settings, self.state, frame, sighting)
+        self.sighting = self.sighting if sighting is None else sighting
         return tracked
 
     def step(self, image: np.ndarray, time: float) -> Tracked:
@@ -141,35 +303,37 @@ class Tracker:
 
     def compile(self) -> None:
         """Compile all programs now; else the first frames wait for it, and a camera does not."""
+        policy = Policy.of(self.calibration, self.estimator)
         with jax.enable_x64(True):
-            for thread in self.map.estimator.compile(self.policy.in_wide):
+            for thread in self.estimator.compile(policy.in_wide):
                 thread.join()
 
     def points(self) -> Points:
         """Return all landmarks, those gone included."""
         with jax.enable_x64(True):
-            return self.map.points()
+            return self.state.points()
 
     def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
         """Return the frames so far, and all landmarks, as all that was seen later has them: loops
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
-            return joined(self.joins, *smoothed(self.map, history))
+            return joined(self.state.joins, *smoothed(self.state, history))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
         as far as this map tells; None for a filter without a pinhole camera."""
         with jax.enable_x64(True):
-            return self.map.estimator.camera()
+            return self.estimator.camera(self.state.map.state)
 
     def save(self, path: str | Path) -> None:
         """Write all that is needed to go on from here (.npz), whole or not at all.
 
         Raises ValueError before the first frame, when there is nothing to go on from.
         """
-        if self.time is None:
+        if self.state.time is None:
             raise ValueError("a tracker without any frame has nothing to save")
-        persistence.save(path, self, None if self.filter is None else self.filter_name)
+        own = None if self.filter is None else self.filter_name
+        persistence.save(path, self.state, self.settings, own)
 
     @classmethod
     def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
@@ -195,130 +359,16 @@ class Tracker:
                 f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
             )
         with jax.enable_x64(True):
-            tracker.map.leave()
-        tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1
-        tracker.searching = True
-        tracker.joins = tuple(replace(one, step=-1) for one in tracker.joins)
-        tracker.policy.forget()
+            state = tracker.state.departed()
+        joins = tuple(replace(one, step=-1) for one in state.joins)
+        tracker.state = replace(
+            state,
+            joins=joins,
+            time=None,
+            steps=0,
+            unmeasured=1,
+            searching=True,
+            doubtful=False,
+            image=None,
+        )
         return tracker
-
-    def _searching(self, frame: Frame) -> Tracked:
-        """Look for a map that is known; begin another where there was none for long."""
-        found = known_again(frame.image, self.map, self.policy)
-        if found is not None:
-            return self._back(frame, *found)
-        self.unmeasured += 1
-        corners = bare_corners(frame.image, self.settings)
-        if self.unmeasured <= self.settings.lost_for or len(corners) < LEAST_MATCHES:
-            return Tracked.of(frame, self.map, reason=Lost.NOTHING_EXPECTED)
-        self.map.begin(frame.image, corners)
-        self.unmeasured, self.searching = 0, False
-        return Tracked.of(frame, self.map, created=corners, starts=True)
-
-    def _first(self, frame: Frame) -> Tracked:
-        """Begin the first map with the first frame."""
-        self.map.estimator.compile(self.policy.in_wide)
-        if self.searching:
-            return self._searching(frame)
-        pixels, depths = bare_corners(frame.image, self.settings), None
-        if self.target is not None:
-            self.sighting, pixels, depths = with_target(
-                self.target, frame.image, pixels, self.calibration, self.settings
-            )
-        self.map.begin(frame.image, pixels, depths)
-        return Tracked.of(frame, self.map, created=pixels, starts=True)
-
-    def _next(self, frame: Frame, before: float) -> Tracked:
-        """Track a frame after one of the time `before`."""
-        if self.searching:
-            return self._searching(frame)
-        last = self.map.place.camera.T_wc
-        predicted = self.map.estimator.predict(frame.time - before)
-        ahead, behind = predicted.view.sides
-        if behind > ahead and behind >= LEAST_MATCHES:
-            self.reversed += 1
-            self.map.seen = None  # nobody is to come back to it
-            self.map.coast(predicted)
-            return self._lost(frame, Lost.REVERSED)
-        lost = self.unmeasured > 0
-        seen, reason = self.policy.observed(frame.image, self.map, predicted, lost=lost)
-        if reason is not None:
-            self.map.remember()
-        # Of two motions that contradict each other a place that is known says no more: it is one of
-        # both.
-        self.elsewhere |= reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
-        self.elsewhere &= reason is not None
-        if self.elsewhere and self.unmeasured:
-            found = known_again(frame.image, self.map, self.policy)
-            if found is not None:
-                return self._back(frame, *found)
-        seen = self.map.weighed(seen)
-        correction = self.map.estimator.correct(predicted, seen)
-        if correction.failed:
-            self.map.remember()
-            self.failed[Status(int(correction.status)).name.lower()] += 1
-            self.map.fall_back(predicted)
-            return self._lost(frame, Lost.NOT_POSITIVE)
-        seen = seen.but_for(correction.used)
-        self.map.note(seen, predicted)
-        if reason is None and not seen.matched.any():
-            reason = Lost.REFUSED
-        self.unmeasured = 0 if reason is None else self.unmeasured + 1
-        if reason is None:
-            self.map.seen = None
-        if not self.landmarks or self.unmeasured > self.settings.lost_for:
-            return self._lost(frame, reason or Lost.NOTHING_EXPECTED, seen)
-        kept = in_view(self.landmarks, seen.slots, self.settings)
-        # What a lost camera sees may be another place: it is not put into this map.
-        created = np.zeros((0, 2))
-        if reason is None:
-            created = bare_corners(frame.image, self.settings, seen.places[kept])
-        ended = len(self.map.submaps)
-        self.map.renew(frame.image, created, seen.slots[kept])
-        if reason is None and self.steps % LOOKED_EVERY == 0:
-            found = known_elsewhere(frame.image, self.map, self.policy, self.joins)
-            if found is not None:
-                return self._joined(frame, last, *found)
-        closed = None
-        if len(self.map.submaps) > ended:
-            closed = close_loop(frame.image, self.map, self.calibration)
-            self.refused += closed is not None and not closed.believed
-        if reason is None and self.steps % NOTED_EVERY == 0:
-            note_looks(self.landmarks.values(), frame.image)
-        nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        found = {"nis": nis, "nis_dof": nis_dof, "reason": reason}
-        if closed is not None and closed.believed:
-            found["loop"] = closed.submap
-        return Tracked.of(frame, self.map, seen, created=created, **found)
-
-    def _joined(
-        self, frame: Frame, last: np.ndarray, seen: Observations, correction: Correction
-    ) -> Tracked:
-        """Go on in another map, which this one is joined to; `last` is T of the camera before."""
-        before = self.map.left[-1]
-        tracked = self._back(frame, seen, correction)
-        join = join_of(before, self.map, self.steps, last)
-        self.joins += () if join is None else (join,)
-        return tracked
-
-    def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
-        """Go on in a map in which the camera was found again."""
-        self.map.note(seen)
-        self.map.renew(frame.image, np.zeros((0, 2)))
-        self.map.estimator.at_rest()
-        self.unmeasured, self.searching = 0, False
-        self.policy.forget()
-        nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        return Tracked.of(frame, self.map, seen, nis=nis, nis_dof=nis_dof, relocalised=True)
-
-    def _lost(self, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Tracked:
-        """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
-        corners = bare_corners(frame.image, self.settings)
-        self.map.renew(frame.image, corners[:0])
-        if len(corners) < LEAST_MATCHES:
-            return Tracked.of(frame, self.map, seen, reason=reason)
-        self.map.restart()
-        self.map.begin(frame.image, corners)
-        self.unmeasured = 0
-        self.policy.forget()
-        return Tracked.of(frame, self.map, seen, created=corners, reason=reason, starts=True)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
-from jaxslam.io.tum import write_tum
 from jaxslam.tracking.pose_with_covariance import Positions
 
 TRACKED = Convention("split", "body")
@@ -45,14 +44,6 @@ class RelativeError(TypedDict):
     translation: float
     rotation: float
     way: float
-
-
-def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
-    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
-
-    All poses of a map are in one unit of length (docs/gauge.md), and the header says so.
-    """
-    write_tum(path, times, T_wc, "in the unit of each map (frames.csv)")
 
 
 def write_covariances(
@@ -108,12 +99,10 @@ def absolute_trajectory_error(
     }
 
 
-def orientation_error(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> float:
+def orientation_error(*trajectories: ArrayLike) -> float:
     """The `orientation_rmse` of `absolute_trajectory_error`, of the same arguments, also of cameras
     that only turn. Raises ValueError where fewer than three poses pair up."""
-    pairs = _paired(estimate_times, estimate, reference_times, reference)
+    pairs = _paired(*trajectories)
     return _by_orientation(pairs.estimate, pairs.reference)[1]
 
 
@@ -146,12 +135,10 @@ def relative_pose_error(
     }
 
 
-def alignment(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> Similarity:
+def alignment(*trajectories: ArrayLike) -> Similarity:
     """Return the similarity from the estimate's world to the reference's: that of
     `absolute_trajectory_error`, of the same arguments; it raises the same."""
-    return _paired(estimate_times, estimate, reference_times, reference).alignment()
+    return _paired(*trajectories).alignment()
 
 
 class _Pairs(NamedTuple):
@@ -171,13 +158,9 @@ class _Pairs(NamedTuple):
         return self.alignment().moved(self.estimate)
 
 
-def _paired(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
-) -> _Pairs:
+def _paired(*trajectories: ArrayLike) -> _Pairs:
     """Poses of the same time. Raises ValueError for fewer than three."""
-    times, T, true_times, true = (
-        np.asarray(x, float) for x in (estimate_times, estimate, reference_times, reference)
-    )
+    times, T, true_times, true = (np.asarray(x, float) for x in trajectories)
     theirs, ours = associated(true_times, times)
     if len(ours) < 3:
         raise ValueError(

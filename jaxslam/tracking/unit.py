@@ -7,7 +7,7 @@ move.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -47,7 +47,7 @@ def lengthened(before: Nearness, now: Nearness, among: Iterable[int]) -> float:
     return float(np.log(new / old)) if old > 0 and new > 0 else 0.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class MapInWorld:
     """The place where a map begins in the world, that of the camera, and the unit of both."""
 
@@ -76,30 +76,25 @@ class MapInWorld:
         """The filter's unit of length in the map's."""
         return float(np.exp(self.log_unit))
 
-    def begin(self, report: CameraReport) -> None:
-        """Take over what the filter says of the first camera of a map: the metre is the unit."""
-        self.log_unit = float(report.log_scale)
-        self._take(report)
+    def begun(self, report: CameraReport) -> MapInWorld:
+        """What the filter says of the first camera of a map: the metre is the unit."""
+        return replace(self, log_unit=float(report.log_scale))._reported(report)
 
-    def follow(self, report: CameraReport, near: Nearness, found: Iterable[int]) -> None:
-        """Take over what the filter says of its camera; how `near` the landmarks are to it now, by
-        the numbers of those that were found again, tells what became of its unit."""
-        if not self.unit_fixed:
-            self.log_unit += lengthened(self.near, near, found)
-        self._take(report)
+    def followed(self, report: CameraReport, near: Nearness, found: Iterable[int]) -> MapInWorld:
+        """What the filter says of its camera; how `near` the landmarks are to it now, by the
+        numbers of those that were found again, tells what became of its unit."""
+        longer = 0.0 if self.unit_fixed else lengthened(self.near, near, found)
+        return replace(self, log_unit=self.log_unit + longer)._reported(report)
 
-    def correct(self, T_bc: Transform, covariance: Float[np.ndarray, "6 6"]) -> Transform:
-        """Take over what a loop says of the present camera, in the filter's unit: T from the world
-        as it was to the world as it is now."""
-        before = self.camera.T_wc
-        self.told, self.known = self.here, PoseWithCovariance(T_bc, covariance).scaled(self.unit)
-        self._set(self.here)
-        return self.camera.T_wc @ np.linalg.inv(before)
+    def corrected(self, T_bc: Transform, covariance: Float[np.ndarray, "6 6"]) -> MapInWorld:
+        """What a loop says of the present camera, in the filter's unit."""
+        known = PoseWithCovariance(T_bc, covariance).scaled(self.unit)
+        return replace(self, told=self.here, known=known)._with_camera(self.here)
 
-    def restart(self) -> None:
-        """Let what comes begin where the camera is."""
-        self.origin = self.camera
-        self.told = self.known = PoseWithCovariance()
+    def restarted(self) -> MapInWorld:
+        """What comes begins where the camera is."""
+        nothing = PoseWithCovariance()
+        return replace(self, origin=self.camera, told=nothing, known=nothing)
 
     def expected(self, view: Prediction) -> Prediction:
         """Return what the filter expects, in the world and in the map's unit."""
@@ -118,26 +113,47 @@ class MapInWorld:
         _, in_map = PoseWithCovariance(self.origin.T_wc).points(points, covariances)
         return *self.origin.points(points, covariances), in_map
 
-    def _take(self, report: CameraReport) -> None:
-        self.unit_fixed = bool(report.unit_fixed)
-        self._set(PoseWithCovariance(report.T_wc, report.covariance).scaled(self.unit))
-        self.log_scale = float(report.log_scale) - self.log_unit
-        variance = report.variance
-        self.sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None
+    def _reported(self, report: CameraReport) -> MapInWorld:
+        here = PoseWithCovariance(report.T_wc, report.covariance).scaled(self.unit)
+        variance = float(report.variance)
+        return replace(
+            self._with_camera(here),
+            unit_fixed=bool(report.unit_fixed),
+            log_scale=float(report.log_scale) - self.log_unit,
+            sigma_log_scale=float(np.sqrt(variance)) if variance > 0 else None,
+        )
 
     @property
     def _moved(self) -> Transform:
         """By how much a loop moved what is here, from where the map begins."""
         return self.known.T_wc @ np.linalg.inv(self.told.T_wc)
 
-    def _set(self, here: PoseWithCovariance) -> None:
-        """Take over where the filter has its camera, from where the map begins.
+    def _with_camera(self, here: PoseWithCovariance) -> MapInWorld:
+        """Where the filter has its camera, from where the map begins.
 
         Of what it did not know when a loop closed, that is left which was not known then.
         """
-        self.here = here
         T_now, T_told = here.T_wc, self.told.T_wc
         A = adjoint(np.linalg.inv(T_now) @ T_told)
         since = positive(here.covariance - A @ self.told.covariance @ A.T)
         covariance = since + A @ self.known.covariance @ A.T
-        self.camera = self.origin.then(PoseWithCovariance(self._moved @ T_now, covariance))
+        camera = self.origin.then(PoseWithCovariance(self._moved @ T_now, covariance))
+        return replace(self, here=here, camera=camera)
+
+
+@dataclass(frozen=True)
+class Join:
+    """A map in the world and in the unit of another, in which its camera was known again."""
+
+    map: int
+    """The number of the map that is joined."""
+    to: int
+    """The number of the other map."""
+    step: int
+    """The frame, counted from 0, whose camera is in the other map."""
+    moved: Transform
+    """The motion of that camera since the frame before, in the map's own unit."""
+    log_ratio: float
+    """The log of the map's unit in that of the other."""
+    sigma: float
+    """σ of the log of the unit."""

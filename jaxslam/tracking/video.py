@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam._runtime.files import write_json
+from jaxslam._runtime.files import write_json, write_text
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.source import Frame, Source
 from jaxslam.plots.tracking import plot_map
@@ -17,7 +17,7 @@ from jaxslam.tracking.film import Aside, OverlayWriter
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.overlay import overlay_of, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
-from jaxslam.tracking.report import Tracked, write_frames
+from jaxslam.tracking.report import TEXTS, Tracked, add_latest
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import (
     TOO_SURE,
@@ -29,11 +29,7 @@ from jaxslam.tracking.summary import (
 )
 from jaxslam.tracking.target import Target
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import (
-    absolute_trajectory_error,
-    write_covariances,
-    write_trajectory,
-)
+from jaxslam.tracking.trajectory import absolute_trajectory_error, write_covariances
 from jaxslam.tracking.viewer import Viewer
 
 
@@ -53,12 +49,14 @@ def track(
     `map.ply`, `map.npz`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and
     return the summary.
 
-    An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
-    the frames so far, and is raised again; an interruption of the first frame or the second leaves
-    none. `slam` is a filter of your own, in place of the one that the settings name. `target`,
-    known points that the first frame sees, makes the map metric. `known` is the `map.npz` of
-    another video by the same camera: this one goes on with that map where it is known again, by its
-    settings. `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
+    `trajectory.txt` and `frames.csv` grow with every frame from the second on, so that whatever
+    ends the process leaves them of the frames so far. An interruption (KeyboardInterrupt), an
+    unreadable frame (ValueError) or a smoothing that fails leaves all files for these, and is
+    raised again; an interruption of the first frame or the second leaves none. `slam` is a filter
+    of your own, in place of the one that the settings name. `target`, known points that the first
+    frame sees, makes the map metric. `known` is the `map.npz` of another video by the same camera:
+    this one goes on with that map where it is known again, by its settings. `viewer` is a file for
+    the rerun viewer, FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:
@@ -77,20 +75,22 @@ def track(
             start = time.perf_counter()
             for frame in source:
                 history.append(tracker.track(frame))
+                add_latest(out, history)
                 show(frame)
                 now = time.perf_counter()
                 seconds.append(now - start)
                 start = now
                 progress(1)
+        smooth = tracker.smoothed(history)
     except BaseException as error:
         # After the first frame there is nothing to tell yet, and what tells it may be compiling.
         if len(history) > isinstance(error, KeyboardInterrupt):
-            _write(source, tracker, history, seconds, out, smooth=False)
+            _write(source, tracker, history, (history, tracker.points()), seconds, out)
             if isinstance(error, KeyboardInterrupt):
                 told = f"{out} has the files of the {len(history)} frames so far"
                 raise KeyboardInterrupt(told) from None
         raise
-    return _write(source, tracker, history, seconds, out, smooth=True)
+    return _write(source, tracker, history, smooth, seconds, out)
 
 
 @contextmanager
@@ -132,24 +132,22 @@ def _writer(source: Source, path: Path) -> OverlayWriter:
 def _write(
     source: Source,
     tracker: Tracker,
-    history: list[Tracked],
+    before: list[Tracked],
+    now: tuple[list[Tracked], Points],
     seconds: list[float],
     out: Path,
-    *,
-    smooth: bool,
 ) -> Summary:
-    """Of frames as they are known at the end, if `smooth`: whoever interrupts does not wait."""
-    before, points = history, tracker.points()
-    if smooth:
-        history, points = tracker.smoothed(history)
-    times, T_wc = trajectory_of(history)
-    write_trajectory(out / "trajectory.txt", times, T_wc)
+    """Write all files, of frames and landmarks as they are known now, and as they were `before`."""
+    history, points = now
+    for name, text in TEXTS.items():
+        write_text(out / name, text(history))
+    tracker.save(out / "map.npz")
+    times = [result.time for result in history]
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
     camera = tracker.camera()
     caveat = TOO_SURE if camera is not None and camera[0] == "estimated" else ""
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
-    write_frames(out / "frames.csv", history)
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:
         assert source.reference is not None
@@ -157,7 +155,6 @@ def _write(
             error = absolute_trajectory_error(*trajectory_of(before), *source.reference)
             summary["ate_causal"] = error
     write_json(out / "summary.json", summary, allow_nan=False)
-    tracker.save(out / "map.npz")
     known = known_points(points, history)
     _draw_map(known, history, before, reference_in_map(source, history), out)
     return summary

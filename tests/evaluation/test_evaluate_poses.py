@@ -734,7 +734,7 @@ def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     T, P, truth = T[0], P[0].copy(), truth[0].copy()
     P[0], truth[0] = 0, T[0]
     times = np.arange(300) / 30
-    trajectory.write_trajectory(tmp_path / "trajectory.txt", times, T)
+    write_tum(tmp_path / "trajectory.txt", times, T)
     trajectory.write_covariances(tmp_path / "covariance.txt", times, P, given_scale=True)
     write_tum(tmp_path / "groundtruth.txt", times, truth)
     found = jaxslam.evaluate_log(tmp_path)

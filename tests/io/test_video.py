@@ -112,6 +112,13 @@ def test_a_video_that_ends_early_says_so(monkeypatch, tmp_path):
         assert len(file.read_times(tmp_path / "v.mp4")) == 2
 
 
+def test_pictures_that_were_dropped_are_no_early_end(monkeypatch, tmp_path):
+    """Of a file that states no number it is computed from its length, here nine pictures'."""
+    times = [0.0, 0.04, 0.2, 0.32]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told(times, [], stated=9))
+    np.testing.assert_array_equal(file.read_times(tmp_path / "v.mkv"), times)
+
+
 def test_a_picture_that_is_gone_when_it_is_reached_is_named(filmed, calibration):
     source = open_source(filmed, calibration=calibration)
     filmed.write_bytes(b"")

@@ -22,13 +22,13 @@ SMALL = TrackerSettings(filter="world", wanted=12, spare=4)
 
 
 @pytest.fixture(scope="module")
-def estimator():
-    """Of a tracker after four frames."""
+def estimated():
+    """Of a tracker, and its state after four frames."""
     source = synthetic_source(frames=4)
     tracker = Tracker(source.calibration, SMALL)
     for frame in source:
         tracker.track(frame)
-    return tracker.map.estimator
+    return tracker.estimator, tracker.map.state
 
 
 def found(predicted, slots, aside, variances):
@@ -38,12 +38,13 @@ def found(predicted, slots, aside, variances):
     return Matches(np.arange(count), pixels, np.ones(count, np.float32), np.array(variances))
 
 
-def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(estimator):
+def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(estimated):
+    estimator, state_before = estimated
     slots = np.array([0, 3, 3, 5])  # one landmark was found twice
     variances = np.array([0.0, 1.0, 2.0, 3.0]) * SMALL.pixel_sigma**2 / FIT
     aside = np.array([[0.1, 0.0], [0.2, -0.1], [2.0, 1.0], [0.0, 0.3]])
     with jax.enable_x64(True):
-        predicted = estimator.predict(1 / 30)
+        predicted = estimator.predict(state_before, 1 / 30)
         matches = found(predicted, slots, aside, variances)
         residual, S, valid, _ = estimator.candidates(predicted, slots, matches, curved=False)
         factors = jnp.array([1.0, 1.0, 2.0, 3.0])
@@ -57,12 +58,13 @@ def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(es
     assert valid.all()
 
 
-def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(estimator):
+def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(estimated):
     """To first order: of a match a hundredth of a pixel aside, as exactly as may be."""
+    estimator, state_before = estimated
     slots, aside = np.array([1, 4]), np.array([[0.01, 0.0], [-0.005, 0.01]])
     variances = np.array([0.0, 4.0]) * SMALL.pixel_sigma**2 / FIT
     with jax.enable_x64(True):
-        predicted = estimator.predict(1 / 30)
+        predicted = estimator.predict(state_before, 1 / 30)
         matches = found(predicted, slots, aside, variances)
         seen = Observations(
             slots,
@@ -94,12 +96,13 @@ def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(esti
     )
 
 
-def test_each_innovation_given_all_others_is_what_they_leave_of_it(estimator):
+def test_each_innovation_given_all_others_is_what_they_leave_of_it(estimated):
     """By the conditional Gaussian, one after the other."""
+    estimator, state_before = estimated
     slots, aside = np.array([1, 4, 6]), np.array([[1.0, 0.0], [-0.5, 1.0], [0.3, -0.2]])
     variances = np.array([0.0, 4.0, 0.0]) * SMALL.pixel_sigma**2 / FIT
     with jax.enable_x64(True):
-        predicted = estimator.predict(1 / 30)
+        predicted = estimator.predict(state_before, 1 / 30)
         pixels = predicted.view.pixels[slots] + aside
         prior = predicted.view.pixels[slots], predicted.view.covariances[slots]
         seen = Observations(slots, *prior, pixels, variances, np.full(3, "matched"))
@@ -112,10 +115,11 @@ def test_each_innovation_given_all_others_is_what_they_leave_of_it(estimator):
         np.testing.assert_allclose(one @ one, left @ np.linalg.solve(P, left), rtol=1e-8)
 
 
-def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimator):
+def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimated):
+    estimator, state_before = estimated
     slots, aside = np.array([0, 2, 6]), np.array([[0.2, 0.1], [0.0, -0.3], [0.4, 0.0]])
     with jax.enable_x64(True):
-        predicted = estimator.predict(1 / 30)
+        predicted = estimator.predict(state_before, 1 / 30)
         pixels = jnp.array(predicted.view.pixels[slots] + aside)
         features = Features(jnp.array(slots), pixels, jnp.ones(3, bool), jnp.full(3, 4.0))
         at = predicted.gaussian, predicted.dt

@@ -1,16 +1,17 @@
 """Pictures one by one, and a tracker that goes on from a file as if nothing had been."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import jaxslam
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.io.pictures import as_grey
-from jaxslam.tracking.landmarks import Landmark, stacked, unstacked
-from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.persistence import save
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.tracker import Tracker, start, step
 
 FRAMES, HALF = 10, 5
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
@@ -51,6 +52,24 @@ def test_step_is_track_with_the_frames_counted(video):
     assert one.steps == other.steps == 3
 
 
+def test_a_tracker_is_a_fold_and_a_state_that_is_kept_is_gone_on_from_again(video):
+    calibration, frames = video
+    slam, tracker = SETTINGS.make_filter(calibration), Tracker(calibration, SETTINGS)
+    assert isinstance(slam, jaxslam.Slam)
+    state, kept = start(slam, SETTINGS, calibration), []
+    for frame in frames[:4]:
+        kept.append(state)
+        state, tracked = step(slam, SETTINGS, state, frame)
+        same(tracked, tracker.track(frame))
+    numbers = [(one.steps, one.created, one.map.number) for one in kept]
+    _, again = step(slam, SETTINGS, kept[2], frames[2])
+    after, _ = step(slam, SETTINGS, kept[2], replace(frames[3], image=0 * frames[3].image))
+    assert after.unmeasured == 1
+    same(step(slam, SETTINGS, kept[3], frames[3])[1], tracked)
+    assert again.index == 2
+    assert [(one.steps, one.created, one.map.number) for one in kept] == numbers
+
+
 @pytest.mark.slow
 def test_a_loaded_tracker_goes_on_digit_by_digit(video, tmp_path):
     calibration, frames = video
@@ -74,30 +93,24 @@ def test_a_loaded_tracker_goes_on_digit_by_digit(video, tmp_path):
         assert getattr(tracker, count) == getattr(loaded, count), count
 
 
-def test_landmarks_are_the_same_after_their_arrays():
-    draw = np.random.default_rng(0)
-    picture = draw.integers(0, 256, (60, 60), dtype=np.uint8)
-    landmarks = {
-        slot: Landmark(
-            7 + slot,
-            Patch.take(picture, np.array([30.2, 29.7])),
-            np.eye(4),
-            np.array([3.5, slot]),
-            0.7,
-            4,
-            slot,
-        )
-        for slot in (2, 0)
-    }
-    again = unstacked(stacked(landmarks))
-    assert list(again) == [2, 0]
-    for slot, landmark in landmarks.items():
-        for name in ("number", "success", "missed", "unseen"):
-            assert getattr(again[slot], name) == getattr(landmark, name)
-        np.testing.assert_array_equal(again[slot].seen_at, landmark.seen_at)
-        np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
-        np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)
-    assert unstacked(stacked({})) == {}
+def test_what_several_records_share_is_written_once_and_shared_again(video, tmp_path):
+    calibration, frames = video
+    tracker = Tracker(calibration, SETTINGS)
+    tracker.track(frames[0])
+    state = tracker.state
+    kept = replace(state, seen=state.map, left=(state.map, replace(state.map, number=7)))
+    save(tmp_path / "once.npz", state, SETTINGS, None)
+    save(tmp_path / "t.npz", kept, SETTINGS, None)
+    again = Tracker.load(tmp_path / "t.npz").state
+    assert again.seen is again.map is again.left[0]
+    assert again.left[1].landmarks[2] is again.map.landmarks[2]
+    assert list(again.landmarks) == list(state.landmarks)
+    for one, other in zip(again.landmarks.values(), state.landmarks.values(), strict=True):
+        assert (one.number, one.success, one.unseen) == (other.number, other.success, other.unseen)
+        np.testing.assert_array_equal(one.patch.stored, other.patch.stored)
+        np.testing.assert_array_equal(one.looks, other.looks)
+    sizes = [(tmp_path / name).stat().st_size for name in ("once.npz", "t.npz")]
+    assert sizes[1] < 1.1 * sizes[0]
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 from jaxslam._runtime.programs import _Call, exactly
 from jaxslam.io.calibration import Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
-from jaxslam.tracking.landmarks import NO_POINTS
+from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import _calibration
 from jaxslam.tracking.synthetic import synthetic_source
@@ -75,7 +75,8 @@ def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_that_are_kn
 
 def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
     settings = TrackerSettings(filter="world", wanted=10, calibration="consider")
-    told = _calibration(Tracker(GUESSED, settings), [], NO_POINTS)
+    nothing = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
+    told = _calibration(Tracker(GUESSED, settings), [], nothing)
     assert (told["treatment"], told["estimated"]["fx"]) == ("consider", GUESSED.fx)
     assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
     assert "caveat" not in told

@@ -16,7 +16,7 @@ from jaxslam.cli.track import TrackOptions
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.tracking import overlay, summary
 from jaxslam.tracking import video as tracking
-from jaxslam.tracking.landmarks import NO_POINTS
+from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -140,7 +140,8 @@ def test_a_focal_length_that_does_not_fit_is_told(tmp_path, monkeypatch, left, s
 def test_a_focal_length_that_is_estimated_is_not_tried(monkeypatch):
     monkeypatch.setattr(summary, "better_focal", fail)
     guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
-    assert "better_focal" not in summary._calibration(guessed, [], NO_POINTS)
+    nothing = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
+    assert "better_focal" not in summary._calibration(guessed, [], nothing)
 
 
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):

@@ -9,6 +9,8 @@ from jaxslam.evaluation import errors_beyond_scale, pose_errors, read_covariance
 from jaxslam.evaluation.inputs import exactly_known
 from jaxslam.io.tum import poses, read_tum, write_tum
 from jaxslam.statistics.beyond_scale import one_scale
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.report import Tracked, trajectory_text
 from jaxslam.tracking.trajectory import (
     TRACKED,
     absolute_trajectory_error,
@@ -16,7 +18,6 @@ from jaxslam.tracking.trajectory import (
     orientation_error,
     relative_pose_error,
     write_covariances,
-    write_trajectory,
 )
 
 
@@ -285,8 +286,8 @@ def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words
     write_covariances(path, [0.0], np.eye(6)[None], given_scale=given, caveat="with care")
     assert path.read_text().splitlines()[0] == header.removesuffix(")") + "; with care)"
     assert read_covariances(path).said["scale"] == ("given" if given else "marginal")
-    write_trajectory(path, [0.0], np.eye(4)[None])
-    assert "in the unit of each map" in path.read_text()
+    first = Tracked(0, 0.0, PoseWithCovariance())
+    assert "in the unit of each map" in trajectory_text([first]).splitlines()[0]
 
 
 def test_a_pose_that_is_known_exactly_is_so_in_the_file(tmp_path):

@@ -17,7 +17,7 @@ from jaxslam.geometry import scaled
 from jaxslam.tracking import search as searching
 from jaxslam.tracking.estimator import CameraReport
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
-from jaxslam.tracking.report import write_frames
+from jaxslam.tracking.report import frames_text
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -181,7 +181,7 @@ def test_a_start_that_is_found_out_ends_in_one_unit(plain, started):
         same(found, expected, ratio, within=1e-4)
     # What this filter makes of the depths meanwhile changes by less than its units do.
     shares = np.array(places[1:FIXED]) / truth[1:FIXED] / ratio
-    units = np.asarray(started.tracker.map.estimator.slam.opening)
+    units = np.asarray(started.tracker.estimator.slam.opening)
     assert np.abs(np.log(shares)).max() < 0.3 < np.abs(np.diff(units)).max()
     # The log of the map's unit: what the filter takes for metres, by what is written.
     expected = WANDER[FRAMES - 1] - np.log(ratio)
@@ -247,7 +247,7 @@ def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed()
     for fixed, units in ((False, 1), (True, 2), (True, 2)):
         flags = *np.array([fixed, False]), np.ones(9, bool)
         report = CameraReport(np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), *flags)
-        place.follow(report, {7: 2.0, 8: 50.0}, [7])
+        place = place.followed(report, {7: 2.0, 8: 50.0}, [7])
         assert place.log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
         assert place.unit_fixed is fixed
 
@@ -277,7 +277,7 @@ def test_frames_csv_says_what_the_unit_is_taken_for(wanders, started, tmp_path):
         for result in started.results
     ]
     for history, log_scales in ((wanders.results, None), (doubtful, 0.1 * np.arange(FRAMES))):
-        write_frames(tmp_path / "frames.csv", history)
+        (tmp_path / "frames.csv").write_text(frames_text(history))
         with (tmp_path / "frames.csv").open() as file:
             rows = list(csv.DictReader(file))
         fixed = [int(result.unit_fixed) for result in history]
@@ -307,15 +307,16 @@ def test_what_a_loop_says_of_the_camera_is_kept_and_grows_with_what_is_not_known
         return CameraReport(T, P, *np.zeros(2), *np.array([True, False]), np.ones(9, bool))
 
     place = MapInWorld(log_unit=np.log(unit))
-    place.follow(report(T_then, then), {}, [])
+    place = place.followed(report(T_then, then), {}, [])
     before = place.camera.T_wc
-    moved = place.correct(T_moved @ T_then, known)
+    place = place.corrected(T_moved @ T_then, known)
+    moved = place.camera.T_wc @ np.linalg.inv(before)
     there = PoseWithCovariance(T_moved @ T_then, known).scaled(unit)
     assert place.camera.T_wc == pytest.approx(there.T_wc, abs=1e-12)
     assert place.camera.covariance == pytest.approx(there.covariance, abs=1e-12)
     assert moved @ before == pytest.approx(place.camera.T_wc, abs=1e-12)
     A = adjoint(np.linalg.inv(T_since))
-    place.follow(report(T_then @ T_since, A @ then @ A.T + since), {}, [])
+    place = place.followed(report(T_then @ T_since, A @ then @ A.T + since), {}, [])
     expected = PoseWithCovariance(T_moved @ T_then @ T_since, A @ known @ A.T + since).scaled(unit)
     assert place.camera.T_wc == pytest.approx(expected.T_wc, abs=1e-12)
     assert place.camera.covariance == pytest.approx(expected.covariance, abs=1e-12)

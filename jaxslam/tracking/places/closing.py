@@ -7,18 +7,17 @@ where the chain of submaps, with its covariance, says that it can be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.map import Map
+from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.observations import Prediction, Slots
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.places.descriptors import candidates, described_corners
+from jaxslam.tracking.places.descriptors import ByNumber, candidates, described_corners
 from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
@@ -33,69 +32,52 @@ GATE = 9 * float(chi2.ppf(0.999, 6))
 pictures a drift is up to 2.5 times what its σ says; another place is off by ten times that."""
 
 
-class Closed(NamedTuple):
-    """A place that was known again."""
-
-    submap: int
-    """The number of the submap that it is of, among those of all maps."""
-    nis: float
-    """The NIS of the place, with six degrees of freedom."""
-
-    @property
-    def believed(self) -> bool:
-        """Whether it can be there."""
-        return self.nis < GATE
-
-
-def close_loop(image: Picture, map: Map, calibration: Calibration) -> Closed | None:
-    """Return which earlier submap the picture at the end of the latest one shows: if that is
-    believed, the `map` has learnt of it."""
+def close_loop(image: Picture, state: TrackerState) -> tuple[TrackerState, int | None]:
+    """Return the state, which has learnt of the earlier submap that the picture at the end of the
+    latest one shows, and the number of that submap; None where there is none, or not to be believed
+    (`refused`)."""
+    map, settings, slam = state.map, state.estimator.settings, state.estimator.slam
     *earlier, latest = map.submaps
     if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < max(APART, len(earlier) // 8):
-        return None
-    kept = map.charted.keys() - set(latest.numbers.tolist())
+        return state, None
+    kept = state.charted.keys() - set(latest.numbers.tolist())
     if not kept:
-        return None
-    gone = {number: map.charted[number] for number in kept}
-    numbers, pixels = candidates(gone, described_corners(image))
-    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
+        return state, None
+    gone = {number: state.charted[number] for number in kept}
+    by_number = candidates(gone, described_corners(image))
     shown = [sum(n in by_number for n in one.numbers.tolist()) for one in earlier]
     for p in np.argsort(shown)[::-1][:TRIED].tolist():
         if shown[p] < FEWEST:
-            return None
-        found = _seen_in(image, earlier[p], by_number, map, calibration)
+            return state, None
+        found = _seen_in(image, earlier[p], by_number, state)
         if found is None:
             continue
         which = p, len(earlier)
         # σ of a landmark where its patch is found, pixels: it is seen from elsewhere, or later.
-        loop = loop_of(map.estimator.slam, map.submaps, which, *found, 1.0, map.settings.wanted)
-        compared = map.now().graph(map.settings, map.estimator.slam).with_loop(loop)
-        closed = Closed(earlier[p].number, float(compared.nis))
-        if closed.believed:
-            map.learn(loop, compared)
-        return closed
-    return None
+        loop = loop_of(slam, map.submaps, which, *found, 1.0, settings.wanted)
+        compared = map.graph(settings, slam).with_loop(loop)
+        if not compared.nis < GATE:
+            return replace(state, refused=state.refused + 1), None
+        return replace(state, map=map.learnt(loop, compared)), earlier[p].number
+    return state, None
 
 
 def _seen_in(
-    image: Picture,
-    submap: Submap,
-    by_number: Mapping[int, Float[np.ndarray, " 2"]],
-    map: Map,
-    calibration: Calibration,
+    image: Picture, submap: Submap, by_number: ByNumber, state: TrackerState
 ) -> tuple[Slots, Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
     sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)
-    numbers = submap.numbers.tolist()
+    numbers, calibration = submap.numbers.tolist(), state.calibration
+    settings = state.estimator.settings
     known = [slot for slot, n in enumerate(numbers) if sure[slot] and n in by_number]
     at = np.array([by_number[numbers[slot]] for slot in known]).reshape(-1, 2)
     posed = pose_of(submap.points[known], at, calibration)
     if posed is None:
         return None
-    landmarks = {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
-    expected = _expected(submap, posed[0], sure, map.place.unit, calibration)
-    seen, matches = search(image, landmarks, expected, calibration, map.settings, several=False)
+    landmarks = {s: state.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
+    expected = _expected(submap, posed[0], sure, state.map.place.unit, calibration)
+    seen, matches = search(image, landmarks, expected, calibration, settings, several=False)
     if len(matches.owner) < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
     slots = seen.slots[matches.owner]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ LOOKS = 3
 
 Corners = tuple[Places, UInt8[np.ndarray, "n 32"]]
 """The corners of a picture: pixels and descriptors."""
+ByNumber = Mapping[int, Float[np.ndarray, " 2"]]
+"""Pixels of landmarks."""
 
 
 def describe(
@@ -34,13 +37,16 @@ def describe(
     return descriptors, there
 
 
-def note_looks(landmarks: Iterable[Landmark], image: Picture) -> None:
-    """Note what landmarks look like in the latest picture, those that it shows."""
-    shown = [one for one in landmarks if not one.unseen]
-    pixels = np.array([one.seen_at for one in shown]).reshape(-1, 2)
-    for one, descriptor, there in zip(shown, *describe(image, pixels), strict=True):
+def with_looks(landmarks: Mapping[int, Landmark], image: Picture) -> Mapping[int, Landmark]:
+    """The landmarks with what they look like in the latest picture, those that it shows."""
+    shown = {slot: one for slot, one in landmarks.items() if not one.unseen}
+    pixels = np.array([one.seen_at for one in shown.values()]).reshape(-1, 2)
+    looking = dict(landmarks)
+    for (slot, one), descriptor, there in zip(shown.items(), *describe(image, pixels), strict=True):
         if there:
-            one.looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
+            looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
+            looking[slot] = replace(one, looks=looks)
+    return looking
 
 
 def described_corners(image: Picture) -> Corners:
@@ -51,14 +57,12 @@ def described_corners(image: Picture) -> Corners:
     return corners[there], descriptors[there]
 
 
-def candidates(
-    landmarks: Mapping[int, Landmark], corners: Corners
-) -> tuple[np.ndarray, Float[np.ndarray, "m 2"]]:
-    """Return the keys of landmarks that look like corners of a picture, and these corners."""
+def candidates(landmarks: Mapping[int, Landmark], corners: Corners) -> ByNumber:
+    """Return the corners of a picture that look like landmarks, by the keys of these."""
     owner = np.repeat(list(landmarks), [len(one.looks) for one in landmarks.values()])
     pixels, descriptors = corners
     if len(owner) == 0 or len(pixels) < 2:
-        return np.zeros(0, int), np.zeros((0, 2))
+        return {}
     looks = np.concatenate([one.looks for one in landmarks.values()])
     two = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(looks, descriptors, 2)
     best: dict[int, tuple[float, int]] = {}
@@ -67,4 +71,4 @@ def candidates(
         # The largest ratio of the distance of the most similar descriptor to that of the next.
         if first.distance < 0.85 * second.distance:
             best[slot] = min(best.get(slot, (np.inf, 0)), (first.distance, first.trainIdx))
-    return np.array(list(best), int), pixels[[corner for _, corner in best.values()]]
+    return {number: pixels[corner] for number, (_, corner) in best.items()}

@@ -8,7 +8,7 @@ that is the similarity, Sim(3), between two maps of one camera (Strasdat et al.,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from scipy.stats import median_abs_deviation
 
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.landmarks import Points
-from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.patches import Picture, Places
 from jaxslam.tracking.places.relocalisation import known_again, well_known
@@ -24,44 +24,24 @@ from jaxslam.tracking.places.submaps import Submap, in_submaps
 from jaxslam.tracking.policy import Policy
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint, positive
 from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.unit import Join
 
 LOOKED_EVERY = 15
 """Frames between two in which another map is looked for."""
 
 
-@dataclass(frozen=True)
-class Join:
-    """A map in the world and in the unit of another, in which its camera was known again."""
-
-    map: int
-    """The number of the map that is joined."""
-    to: int
-    """The number of the other map."""
-    step: int
-    """The frame, counted from 0, whose camera is in the other map."""
-    moved: Transform
-    """The motion of that camera since the frame before, in the map's own unit."""
-    log_ratio: float
-    """The log of the map's unit in that of the other."""
-    sigma: float
-    """σ of the log of the unit."""
-
-
 def known_elsewhere(
-    image: Picture, map: Map, policy: Policy, joins: Sequence[Join]
-) -> tuple[Observations, Correction] | None:
+    image: Picture, policy: Policy, state: TrackerState
+) -> tuple[TrackerState, Observations, Correction] | None:
     """Do what `known_again` does for a camera that is not lost and maps that are not joined to its
     own."""
-    own = _world(map.number, joins)
-    same = {one.number for one in map.left if _world(one.number, joins) == own}
-    others = [one for one in map.left if one.number not in same]
-    if not (others and map.place.unit_fixed and in_submaps(map.estimator.slam)):
+    number, joins = state.map.number, state.joins
+    own = _world(number, joins)
+    same = {one.number for one in state.left if _world(one.number, joins) == own}
+    others = [one for one in state.left if one.number not in same]
+    if not (others and state.map.place.unit_fixed and in_submaps(state.estimator.slam)):
         return None
-    map.remember()
-    found = known_again(image, map, policy, but=same | {map.number})
-    if found is None:
-        map.seen = None
-    return found
+    return known_again(image, policy, state.remembered(), but=same | {number})
 
 
 def _world(number: int, joins: Sequence[Join]) -> int:
@@ -71,10 +51,10 @@ def _world(number: int, joins: Sequence[Join]) -> int:
     return number
 
 
-def join_of(before: Remembered, map: Map, step: int, last: Transform) -> Join | None:
+def join_of(before: Map, state: TrackerState, last: Transform) -> Join | None:
     """The map as it was `before` joined to that in which the camera was known again in this frame;
     `last` is T of the camera in the frame before. None where too few landmarks are of both."""
-    now, settings, slam = map.now(), map.settings, map.estimator.slam
+    settings, slam, now = state.estimator.settings, state.estimator.slam, state.map
     (pixels, z, variance), (others, depths, variances) = (
         _depths(one, one.graph(settings, slam).present) for one in (before, now)
     )
@@ -96,7 +76,7 @@ def join_of(before: Remembered, map: Map, step: int, last: Transform) -> Join | 
     common = max(float(np.median(variance[i] + variances[j])) - scatter, 0.0)
     sigma = float(np.sqrt(common + np.pi / 2 * scatter / len(ratios)))
     moved = np.linalg.inv(last) @ before.place.camera.T_wc
-    return Join(before.number, now.number, step, moved, ratio, sigma)
+    return Join(before.number, now.number, state.steps, moved, ratio, sigma)
 
 
 def joined(
@@ -153,7 +133,7 @@ def _joined_points(
 
 
 def _depths(
-    one: Remembered, present: Submap
+    one: Map, present: Submap
 ) -> tuple[Places, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Of the landmarks that the latest frame shows: pixels, depths in the map's unit, and the
     variances of their logs."""

@@ -8,7 +8,7 @@ is the camera back.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container
 from dataclasses import replace
 
 import cv2
@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
-from jaxslam.tracking.map import Map
+from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.places.descriptors import candidates, described_corners
+from jaxslam.tracking.places.descriptors import ByNumber, candidates, described_corners
 from jaxslam.tracking.policy import Policy
 from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 
@@ -74,54 +74,52 @@ def pose_of(
 
 
 def known_again(
-    image: Picture, map: Map, policy: Policy, but: Container[int] = ()
-) -> tuple[Observations, Correction] | None:
+    image: Picture, policy: Policy, state: TrackerState, but: Container[int] = ()
+) -> tuple[TrackerState, Observations, Correction] | None:
     """Return what is found of the landmarks in the first place that the picture shows, of those of
-    which it shows the most candidates, and of all maps `but` some: that is then the `map`,
-    corrected by them. None, and nothing changes, where it shows none that is known."""
-    if not map.estimator.displaceable:
+    which it shows the most candidates, and of all maps `but` some, and the state in that map,
+    corrected by them. None where it shows none that is known."""
+    if not state.estimator.displaceable:
         return None
-    numbers, pixels = candidates(map.described(), described_corners(image))
-    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
-    now, places = map.now(), [one for one in map.places() if one.number not in but]
+    by_number = candidates(state.described(), described_corners(image))
+    places = [one for one in state.places() if one.number not in but]
     shown = [sum(x.number in by_number for x in one.landmarks.values()) for one in places]
     for which in np.argsort(np.negative(shown), stable=True)[:TRIED].tolist():
         if shown[which] < FEWEST:
             return None
-        map.become(places[which])
-        # What is only tried is no memory of the policy's.
-        found = _found(image, by_number, map, replace(policy))
-        after = map.now()
-        map.become(now)
+        found = _found(image, by_number, policy, replace(state, map=places[which]))
         if found is not None:
-            map.come_back(places[which], after)
-            return found
+            after, seen, correction = found
+            return state.come_back(places[which], after), seen, correction
     return None
 
 
 def _found(
-    image: Picture, by_number: Mapping[int, Float[np.ndarray, " 2"]], map: Map, policy: Policy
-) -> tuple[Observations, Correction] | None:
-    """The landmarks of this map in a picture that shows some at these pixels, and what they make of
-    it."""
+    image: Picture, by_number: ByNumber, policy: Policy, state: TrackerState
+) -> tuple[Map, Observations, Correction] | None:
+    """This map after a picture that shows some of its landmarks at these pixels, what is found
+    there, and what the filter made of it."""
+    map, place, estimator = state.map, state.map.place, state.estimator
     known = {slot: one.number for slot, one in map.landmarks.items() if one.number in by_number}
     slots = np.array(list(known), int)
     pixels = np.array([by_number[number] for number in known.values()]).reshape(-1, 2)
-    points, covariances = (part[slots] for part in map.estimator.points())
+    points, covariances = (part[slots] for part in estimator.points(map.state))
     sure = well_known(points, covariances)
     posed = pose_of(points[sure], pixels[sure], policy.calibration)
     if posed is None:
         return None
     T_new, _ = posed
-    place = map.place
     T_last = np.linalg.inv(place.origin.T_wc) @ place.camera.T_wc
     T_last[:3, 3] /= place.unit
     depth = np.median((points[sure] - T_new[:3, 3]) @ T_new[:3, 2])
     sigma = np.repeat([SHIFT * depth, TURN], 3)
     # The seconds in which a camera moves there: so few that no acceleration matters.
-    predicted = map.estimator.displaced(np.linalg.inv(T_last) @ T_new, sigma, (1 / 30))
-    seen, reason = policy.observed(image, map, predicted, lost=True)
+    moved = np.linalg.inv(T_last) @ T_new
+    predicted = estimator.displaced(map.state, moved, sigma, (1 / 30))
+    # What is only tried is no memory of the policy's.
+    seen, reason, _ = policy.observed(image, state, predicted, lost=True)
     if reason is not None or seen.matched.sum() < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
-    correction = map.estimator.correct(predicted, seen)
-    return None if correction.failed else (seen.but_for(correction.used), correction)
+    belief, correction = estimator.correct(predicted, seen)
+    after, seen = replace(map, state=belief), seen.but_for(correction.used)
+    return None if correction.failed else (after, seen, correction)

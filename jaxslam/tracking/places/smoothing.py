@@ -6,6 +6,7 @@ later says of the second: as much of that as of the way is behind it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,22 +15,27 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxslam.tracking.landmarks import Points
-from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint
 from jaxslam.tracking.report import Tracked
 
 
-def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
-    """Return the frames and landmarks as they are known now; those of maps with one submap, and of
-    maps that no camera can come back to, stay as they are."""
-    before = map.points()
+def smoothed(state: TrackerState, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+    """Return the frames and landmarks as they are known now; those of maps with one submap, of maps
+    that no camera can come back to, and of one whose poses would not be finite stay as they are."""
+    before = state.points()
     frames, points = list(history), before
     # What branches off is of two: the way from there on, and what led there as the latest has it.
-    for one in (*map.known()[::-1], map.now()):
+    for one in (*state.known()[::-1], state.map):
         if one.submaps:
-            graph = one.graph(map.settings, map.estimator.slam)
-            parts = _parts(one, graph, graph.solved())
+            graph = one.graph(state.estimator.settings, state.estimator.slam)
+            solved = graph.solved()
+            if not all(np.isfinite(x).all() for x in (solved.T_bc, solved.covariances)):
+                told = f"map {one.number} cannot be smoothed: numbers are not finite"
+                warnings.warn(told, stacklevel=2)
+                continue
+            parts = _parts(one, graph, solved)
             for i, camera in _cameras(parts, history).items():
                 frames[i] = replace(history[i], camera=camera)
             points = _seen_from(parts, before, points)
@@ -85,7 +91,7 @@ def _part_of(T: Transform, share: float) -> Transform:
     return part
 
 
-def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
+def _parts(one: Map, graph: Graph, solved: Solved) -> list[_Part]:
     """All submaps of a map, the present one last."""
     place, unit = one.place, one.place.unit
     submaps = [*graph.submaps, graph.present]
