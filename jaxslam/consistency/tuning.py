@@ -24,8 +24,9 @@ from jaxtyping import Array, Float
 from jaxslam._numerics.arrays import AnyArray, cast, is_number
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.protocol import AbstractFilter
-from jaxslam.filters.run import MeasuredRun, run
+from jaxslam.filters.run import Frames, MeasuredRun, run
 from jaxslam.linalg import cholesky
+from jaxslam.models.observations import Capacity, Features
 from jaxslam.statistics.bands import normalised_squared, whiteness_p_value
 
 NOISE = ("motion.noise_sigma", "sensor.sigma")
@@ -142,11 +143,12 @@ class Tuning:
                 lines.append(f"  {which:<24}{was:>10.4g} →{now:>10.4g} {doubt}")
         lines += [f"  before: {self.before}", f"  after:  {self.after}"]
         if self.held_out is not None:
-            lines += [f"  held out, {when}: {fit}" for when, fit in zip(_WHEN, self.held_out)]
+            lines += [
+                f"  held out, {when}: {fit}" for when, fit in zip(_WHEN, self.held_out, strict=True)
+            ]
         return "\n".join(lines)
 
 
-_WHEN = ("before", "after")
 _UNFINISHED = "The search did not end at a maximum: more steps, bounds or priors are needed."
 _SENTENCES = {
     "noise": "The noise below explains the innovations: they are white with it.",
@@ -208,10 +210,10 @@ class _Search(eqx.Module):
     slam: AbstractFilter
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
-    start: tuple[Float[AnyArray, "..."], ...]
+    start: tuple[Float[AnyArray, " _"], ...]
     """Of each name, in coordinates."""
-    low: tuple[Float[AnyArray, "..."], ...]
-    high: tuple[Float[AnyArray, "..."], ...]
+    low: tuple[Float[AnyArray, " _"], ...]
+    high: tuple[Float[AnyArray, " _"], ...]
     prior: tuple[Float[AnyArray, " 2"] | None, ...]
 
     @staticmethod
@@ -251,7 +253,7 @@ class _Search(eqx.Module):
     def first(self) -> Float[Array, " k"]:
         return jnp.concatenate([jnp.asarray(x) for x in self.start])
 
-    def coordinates(self, theta: Float[Array, " k"]) -> list[Float[Array, "..."]]:
+    def coordinates(self, theta: Float[Array, " k"]) -> list[Float[Array, " _"]]:
         """Logarithms of σ, and other numbers, of each name."""
         found, at = [], 0
         for start, low, high in zip(self.start, self.low, self.high, strict=True):
@@ -319,12 +321,34 @@ def _limits(name, value, logarithmic: bool, bounds, prior, settings: TuningSetti
 
 
 def _grouped(logs: Sequence[MeasuredRun]) -> list[MeasuredRun]:
-    """Batches of the logs that have the same shapes."""
+    """Batches of logs, each padded by frames and features that measure nothing to the longest."""
+    capacity = Capacity(*np.max([log.capacity for log in logs], axis=0).tolist())
+    steps = max(log.frames.seen.valid.shape[0] for log in logs)
     alike: dict[object, list[MeasuredRun]] = {}
     for log in logs:
+        log = _padded(log, steps, capacity)
         leaves, structure = jax.tree.flatten(log)
         alike.setdefault((structure, *map(np.shape, leaves)), []).append(log)
     return [jax.tree.map(lambda *x: jnp.stack(x), *same) for same in alike.values()]
+
+
+def _padded(log: MeasuredRun, steps: int, capacity: Capacity) -> MeasuredRun:
+    def features(of: Features, width: int) -> Features:
+        def wider(x):
+            room = [(0, steps - x.shape[0]), (0, width - x.shape[1])]
+            return jnp.pad(x, room + [(0, 0)] * (x.ndim - 2))
+
+        return jax.tree.map(wider, of)
+
+    def longer(x):
+        return jnp.pad(x, [(0, steps - x.shape[0])] + [(0, 0)] * (x.ndim - 1), mode="edge")
+
+    seen = features(log.frames.seen, capacity.seen)
+    new = features(log.frames.new, capacity.new)
+    control, gone = jax.tree.map(longer, (log.frames.control, log.frames.gone))
+    if gone is not None:
+        gone = jnp.pad(gone, ((0, 0), (0, capacity.landmarks - gone.shape[1])))
+    return MeasuredRun(Frames(control, seen, new, gone), capacity, log.first, log.known)
 
 
 class _Records(NamedTuple):
@@ -448,20 +472,21 @@ def _run_records(slam: AbstractFilter, log: MeasuredRun) -> tuple[_Records, _OfF
 def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> Fit:
     """Return how well a filter fits logs, which may be of any length."""
     runs = [_run_records(slam, log) for log in logs]
-    total = _Records(*(float(sum(np.sum(x) for x in part)) for part in zip(*(r for r, _ in runs))))
+    sums = np.sum([[np.sum(part) for part in records] for records, _ in runs], axis=0)
+    total = dict(zip(_Records._fields, sums.tolist(), strict=True))
     nees = [np.asarray(of.nees) for _, of in runs if of.nees is not None]
     degrees = [log.truth.tangent_dim for log in logs if log.truth is not None]
     correlation = mean = p = None
     if all(of.white is not None for _, of in runs):
         correlation, mean, p = _whiteness([np.asarray(of.white) for _, of in runs])
     return Fit(
-        log_likelihood=-total.cost,
-        nis=total.nis / total.dof if total.dof else math.nan,
+        log_likelihood=-total["cost"],
+        nis=total["nis"] / total["dof"] if total["dof"] else math.nan,
         nees=float(np.mean(np.concatenate(nees))) / degrees[0] if nees else None,
         correlation=correlation,
         mean=mean,
         p=p,
-        left_out=total.left_out / max(total.dof + total.left_out, 1),
+        left_out=total["left_out"] / max(total["dof"] + total["left_out"], 1),
     )
 
 
