@@ -14,10 +14,10 @@ from jaxslam.consistency.runs import (
 from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.suite import read_suite, write_suite
 from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
-from jaxslam.consistency.tuning import Fit, Tuning, TuningSettings, fit_of, tune
+from jaxslam.consistency.tuning import LogFit, Tuning, TuningSettings, fit_of, tune
 
 __all__ = [
-    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "Fit", "FolderStore", "MemoryStore", "Results",
+    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "LogFit", "MemoryStore", "Results",
     "Seconds", "SimulatedFrame", "Study", "Summary", "Tuning", "TuningSettings", "check_sizes",
     "draw", "filter_run", "fit_of", "log_likelihood", "monte_carlo", "of_simulation", "read_suite",
     "run_through", "scale_records", "summarise", "table", "tally", "treatment", "tune",

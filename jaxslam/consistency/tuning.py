@@ -43,7 +43,7 @@ class TuningSettings:
     """What a filter leaves out, by its gate, costs as much as what is so many σ off, in the filter
     of the start: else the smallest σ, which leaves out the most, is the likeliest."""
     tolerance: float = 1e-6
-    """Of the mean log likelihood of one number, and of the logarithms of σ."""
+    """The change at which the search ends, of the mean log likelihood and of logarithms of σ."""
     steps: int = 64
     """The most steps of the search."""
     correlation: float = 0.05
@@ -53,18 +53,18 @@ class TuningSettings:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LogFit:
     """How well a filter fits logs: the statistics of its innovations and, with truth, errors."""
 
     log_likelihood: float
-    """Of all measurements, up to a constant that is the same for every filter."""
+    """The log likelihood of all measurements, up to a constant that all filters have."""
     nis: float
     """The mean NIS per degree of freedom: 1 of a right filter."""
     nees: float | None
     """The mean NEES of the pose per degree of freedom, of the logs that have a truth."""
     correlation: float | None
-    """Of innovations, whitened by S, with those of the same landmark a frame later: 0 of a right
-    filter; None where the filter keeps no S."""
+    """The correlation of innovations, whitened by S, with those of the same landmark a frame later:
+    0 of a right filter; None where the filter keeps no S."""
     mean: float | None
     """The largest of the means of the numbers of a whitened innovation: 0 of a right filter."""
     p: float | None
@@ -94,15 +94,16 @@ class Tuning:
     """Those that are likeliest."""
     sigma: Mapping[str, np.ndarray]
     """Their σ, by the Hessian: NaN at a bound, and where the logs do not tell."""
-    before: Fit
+    before: LogFit
     """How the filter that was given fits the logs."""
-    after: Fit
+    after: LogFit
     """How the tuned one does."""
-    held_out: tuple[Fit, Fit] | None
+    held_out: tuple[LogFit, LogFit] | None
     """Both on the logs that were held out, if any."""
     converged: bool
     """Whether the search ended at a maximum."""
     settings: TuningSettings
+    """The settings of the search."""
 
     @property
     def word(self) -> str:
@@ -469,7 +470,7 @@ def _run_records(slam: AbstractFilter, log: MeasuredRun) -> tuple[_Records, _OfF
     return _Records(*found), _OfFrames(white, nees)
 
 
-def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> Fit:
+def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> LogFit:
     """Return how well a filter fits logs, which may be of any length."""
     runs = [_run_records(slam, log) for log in logs]
     sums = np.sum([[np.sum(part) for part in records] for records, _ in runs], axis=0)
@@ -479,7 +480,7 @@ def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> Fit:
     correlation = mean = p = None
     if all(of.white is not None for _, of in runs):
         correlation, mean, p = _whiteness([np.asarray(of.white) for _, of in runs])
-    return Fit(
+    return LogFit(
         log_likelihood=-total["cost"],
         nis=total["nis"] / total["dof"] if total["dof"] else math.nan,
         nees=float(np.mean(np.concatenate(nees))) / degrees[0] if nees else None,

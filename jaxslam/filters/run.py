@@ -88,7 +88,7 @@ class MeasuredRun(eqx.Module):
     frames: PyTree
     """The inputs of the frames after frame 0: `Frames`, or a pytree with its fields."""
     capacity: Capacity = eqx.field(static=True)
-    """Of the filter."""
+    """The capacity of the filter."""
     first: Features | None = None
     """The landmarks of frame 0."""
     known: PriorMap | None = None
