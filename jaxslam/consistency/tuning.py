@@ -144,9 +144,8 @@ class Tuning:
                 lines.append(f"  {which:<24}{was:>10.4g} →{now:>10.4g} {doubt}")
         lines += [f"  before: {self.before}", f"  after:  {self.after}"]
         if self.held_out is not None:
-            lines += [
-                f"  held out, {when}: {fit}" for when, fit in zip(_WHEN, self.held_out, strict=True)
-            ]
+            before, after = self.held_out
+            lines += [f"  held out, before: {before}", f"  held out, after: {after}"]
         return "\n".join(lines)
 
 
