@@ -18,8 +18,8 @@ from jaxslam.consistency.tuning import LogFit, Tuning, TuningSettings, fit_of, t
 
 __all__ = [
     "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "LogFit", "MemoryStore",
-    "Results", "Seconds", "SimulatedFrame", "Study", "Summary", "Tuning", "TuningSettings", "check_sizes",
-    "draw", "filter_run", "fit_of", "log_likelihood", "monte_carlo", "of_simulation", "read_suite",
-    "run_through", "scale_records", "summarise", "table", "tally", "treatment", "tune",
-    "write_suite",
+    "Results", "Seconds", "SimulatedFrame", "Study", "Summary", "Tuning", "TuningSettings",
+    "check_sizes", "draw", "filter_run", "fit_of", "log_likelihood", "monte_carlo",
+    "of_simulation", "read_suite", "run_through", "scale_records", "summarise", "table", "tally",
+    "treatment", "tune", "write_suite",
 ]  # fmt: skip
