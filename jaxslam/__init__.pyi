@@ -2,7 +2,7 @@
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._version import __version__
-from jaxslam.consistency import monte_carlo, summarise, table
+from jaxslam.consistency import Tuning, monte_carlo, summarise, table, tune
 from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
@@ -27,7 +27,7 @@ from jaxslam.filters.remedies.first_estimates import FirstEstimates
 from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.remedies.random_walk import RandomWalk
-from jaxslam.filters.run import Frames, run
+from jaxslam.filters.run import Frames, MeasuredRun, measured_run, run
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.filters.words import FILTERS, make_filter, make_filters
@@ -113,6 +113,7 @@ __all__ = [
     "Keyframe",
     "Known",
     "LandmarkView",
+    "MeasuredRun",
     "Metre",
     "Mixture",
     "ObservabilityConstrained",
@@ -133,6 +134,7 @@ __all__ = [
     "State",
     "Status",
     "Submaps",
+    "Tuning",
     "UnifiedInverseDepth",
     "UnitHomogeneous",
     "White",
@@ -152,6 +154,7 @@ __all__ = [
     "make_filter",
     "make_filters",
     "mean_band",
+    "measured_run",
     "monte_carlo",
     "paper",
     "recommended",
@@ -160,4 +163,5 @@ __all__ = [
     "simulate",
     "summarise",
     "table",
+    "tune",
 ]

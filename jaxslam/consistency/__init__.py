@@ -4,14 +4,22 @@ from jaxslam.consistency.backends import BACKENDS
 from jaxslam.consistency.likelihood import log_likelihood
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
 from jaxslam.consistency.results import FilterResult, Results, Seconds, Summary
-from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
+from jaxslam.consistency.runs import (
+    SimulatedFrame,
+    filter_run,
+    of_simulation,
+    run_through,
+    scale_records,
+)
 from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.suite import read_suite, write_suite
 from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
+from jaxslam.consistency.tuning import LogFit, Tuning, TuningSettings, fit_of, tune
 
 __all__ = [
-    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "MemoryStore", "Results",
-    "Seconds", "SimulatedFrame", "Study", "Summary", "check_sizes", "draw", "filter_run",
-    "log_likelihood", "monte_carlo", "read_suite", "run_through", "scale_records", "summarise",
-    "table", "tally", "treatment", "write_suite",
+    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "LogFit", "MemoryStore",
+    "Results", "Seconds", "SimulatedFrame", "Study", "Summary", "Tuning", "TuningSettings",
+    "check_sizes", "draw", "filter_run", "fit_of", "log_likelihood", "monte_carlo",
+    "of_simulation", "read_suite", "run_through", "scale_records", "summarise", "table", "tally",
+    "treatment", "tune", "write_suite",
 ]  # fmt: skip

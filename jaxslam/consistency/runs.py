@@ -18,6 +18,7 @@ from jaxslam.filters.readouts import (
     landmarks_from_above,
     landmarks_in_camera,
 )
+from jaxslam.filters.run import MeasuredRun
 from jaxslam.filters.run import run as run_filter
 from jaxslam.geometry import Pose, difference
 from jaxslam.models.motion import Control
@@ -58,11 +59,16 @@ def run_through(
     Landmarks that are gone are removed before the step. Raises ValueError for a filter that
     cannot, where a run uses slots again.
     """
+    given = of_simulation(room, run)
+    return run_filter(slam, given.frames, given.start(slam), output)
+
+
+def of_simulation(room: Room, run: Run) -> MeasuredRun:
+    """Return what a filter is given of a simulated run, with the truth."""
     first, seen, new = features(run, room)
     poses, points = jax.tree.map(lambda x: x[1:], (run.poses, run.points_by_frame))
     frames = SimulatedFrame(run.controls, seen, new, gone(run, room), poses, points)
-    known = {} if run.known is None else {"known": run.known}
-    return run_filter(slam, frames, slam.init(room.capacity, first, **known), output)
+    return MeasuredRun(frames, room.capacity, first, run.known, poses)
 
 
 def filter_run(

@@ -1,0 +1,166 @@
+"""Noise and other numbers of a filter, found by the likelihood of its innovations."""
+
+import json
+from dataclasses import replace
+from operator import itemgetter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam.consistency import draw, log_likelihood, of_simulation
+from jaxslam.filters.run import run
+
+MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
+SENSOR = jaxslam.RangeBearing([0.1, 0.02])
+FIELDS = ("motion.noise_sigma", "sensor.sigma")
+LOGS, STEPS = 4, 40
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    posts = jaxslam.Ring(landmarks=4, radius=8.0)
+    return draw(jaxslam.World(MOTION, SENSOR, posts, steps=STEPS, rate=10.0), LOGS + 1)
+
+
+@pytest.fixture(scope="module")
+def logs(simulated):
+    room, runs = simulated
+    each = (jax.tree.map(itemgetter(i), runs) for i in range(LOGS + 1))
+    return [of_simulation(room, one) for one in each]
+
+
+def slam(motion=MOTION, sensor=SENSOR, **pieces):
+    return jaxslam.Slam(motion, sensor, jaxslam.Cartesian(), **pieces)
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    """A filter of which every σ is wrong by factors of 2 to 3."""
+    return slam(jaxslam.Odometry([0.04, 0.015, 0.02]), jaxslam.RangeBearing([0.25, 0.01]))
+
+
+@pytest.fixture(scope="module")
+def tuned(wrong, logs):
+    return jaxslam.tune(wrong, logs[:LOGS], held_out=logs[LOGS:])
+
+
+def test_every_wrong_noise_is_found_within_its_sigma(tuned):
+    assert tuned.converged
+    truth = {"motion.noise_sigma": MOTION.noise_sigma, "sensor.sigma": SENSOR.sigma}
+    for name, values in truth.items():
+        off = (tuned.found[name] - values) / tuned.sigma[name]
+        assert np.all(np.abs(off) < 3.5), name
+        assert np.all(tuned.sigma[name] < 0.25 * values), name
+    assert tuned.word == "noise"
+
+
+def test_the_tuned_filter_is_right_where_the_given_one_was_not(tuned):
+    before, after = tuned.held_out
+    assert before.nis > 1.5
+    assert after.nis == pytest.approx(1, abs=0.2)
+    assert tuned.before.nees > 2 * tuned.after.nees
+    assert tuned.after.log_likelihood > tuned.before.log_likelihood + 100
+    np.testing.assert_array_equal(tuned.slam.sensor.sigma, tuned.found["sensor.sigma"])
+
+
+def test_a_tuning_shows_itself_as_text_and_as_json(tuned):
+    told = str(tuned)
+    assert told.startswith("The noise below explains the innovations")
+    assert "motion.noise_sigma[2]" in told
+    assert json.loads(json.dumps(tuned.to_dict()))["word"] == "noise"
+
+
+def test_a_bias_that_no_noise_explains_is_a_wrong_model(logs):
+    """The odometry turns by 0.05 rad too little in every step."""
+
+    def turned(log):
+        control = log.frames.control - jnp.array([0, 0, 0.05])
+        return replace(log, frames=log.frames._replace(control=control))
+
+    found = jaxslam.tune(slam(), [turned(log) for log in logs[:2]], ["motion.noise_sigma"])
+    assert found.word == "model"
+    assert "No noise explains" in str(found)
+
+
+def test_a_sigma_of_zero_stays_and_bounds_hold(logs):
+    start = slam(jaxslam.Odometry([0.02, 0.0, 0.01]), jaxslam.RangeBearing([0.1, 0.05]))
+    bounds, priors = {"sensor.sigma": (0.03, 0.5)}, {"motion.noise_sigma": (0.02, 2)}
+    found = jaxslam.tune(start, logs[:2], bounds=bounds, priors=priors)
+    assert found.found["motion.noise_sigma"][1] == 0
+    assert found.found["sensor.sigma"] == pytest.approx([0.1, 0.03], rel=0.1)
+    assert np.isnan(found.sigma["sensor.sigma"]).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "message"),
+    [
+        (["sensor.sgima"], {}, "number of the filter 'sensor.sgima' (did you mean sensor.sigma"),
+        (["depth.mean"], {}, "depth.mean is no σ: it needs bounds, or a prior"),
+        (["sensor.sigma"], {"bounds": {"motion.noise_sigma": (1, 2)}}, "bounds of what is not"),
+        (["sensor.sigma"], {"bounds": {"sensor.sigma": (2, 1)}}, "a least and a greatest"),
+        (["sensor.sigma"], {"bounds": {"sensor.sigma": (1, 2)}}, "outside its bounds"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_tuned_is_refused(logs, names, options, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        jaxslam.tune(slam(), logs[:1], names, **options)
+
+
+def test_no_log_is_refused():
+    with pytest.raises(ValueError, match="needs at least one log"):
+        jaxslam.tune(slam(), [])
+
+
+def test_a_log_in_frames_gives_the_likelihood_of_its_simulation(simulated):
+    room, runs = simulated
+    simulated_run = jax.tree.map(lambda x: x[0], runs)
+    frame, landmark = np.nonzero(np.asarray(simulated_run.visible))
+    measured = np.asarray(simulated_run.measured)[frame, landmark]
+    # Landmarks may have any numbers, and measurements any order.
+    order = np.random.default_rng(0).permutation(len(frame))
+    log = jaxslam.measured_run(
+        simulated_run.controls, frame[order], 100 - landmark[order], measured[order]
+    )
+    cost = run(slam(), log.frames, log.start(slam()), lambda s, i, f: i.nis + i.log_det)[1]
+    expected = log_likelihood(slam(), room, simulated_run)
+    np.testing.assert_allclose(-np.sum(cost) / 2, expected, rtol=1e-9)
+
+
+def test_known_landmarks_are_seen_in_frame_0_already_and_never_new():
+    points = np.array([[1.0, 5.0], [-1.0, 6.0]])
+    known = jaxslam.PriorMap(np.array([7, 3]), points, 0.01 * np.eye(4))
+    at = np.array([[5.1, 0.2], [6.1, -0.17], [4.0, 0.0], [4.1, 0.01]])
+    log = jaxslam.measured_run(np.zeros((2, 3)), np.ones(4, int), np.array([3, 7, 5, 5]), at, known)
+    assert log.capacity == jaxslam.Capacity(3, 2, 1)
+    np.testing.assert_array_equal(log.known.slots, [2, 0])
+    np.testing.assert_array_equal(log.frames.seen.slots[0], [0, 2])
+    np.testing.assert_array_equal(log.frames.new.measured[0], at[2:3])
+    assert log.frames.seen.valid.sum() == 2
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_measurements_that_do_not_go_together_are_refused():
+    with pytest.raises(ValueError, match="one entry of each measurement, not 2, 1 and 2"):
+        jaxslam.measured_run(np.zeros((2, 3)), [0, 1], [1], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="frames are those before and after 2 controls, 0 to 2"):
+        jaxslam.measured_run(np.zeros((2, 3)), [0, 3], [1, 1], np.zeros((2, 2)))
+
+
+@pytest.mark.slow  # a gate that shrinks σ to leave out more
+def test_what_a_gate_leaves_out_costs_so_that_noise_does_not_shrink(logs):
+    """One measurement in ten is of another landmark: with its cost the σ of the rest is found."""
+    draw_ = np.random.default_rng(3)
+    spoilt = []
+    for log in logs[:LOGS]:
+        seen = log.frames.seen
+        bad = draw_.random(seen.valid.shape) < 0.1
+        measured = np.where(bad[..., None], np.add(seen.measured, [3.0, 1.0]), seen.measured)
+        seen = replace(seen, measured=jnp.asarray(measured))
+        spoilt.append(replace(log, frames=log.frames._replace(seen=seen)))
+    gated = slam(sensor=jaxslam.RangeBearing([0.2, 0.04]), gate=jaxslam.Gate(tolerance=0.5))
+    found = jaxslam.tune(gated, spoilt, ["sensor.sigma"])
+    assert found.found["sensor.sigma"] == pytest.approx([0.1, 0.02], rel=0.25)
+    assert 0.05 < found.after.left_out < 0.2
