@@ -14,7 +14,6 @@ from jaxslam.filters.words import FILTERS, make_filter
 from jaxslam.io.calibration import Calibration
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
-from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
@@ -121,15 +120,12 @@ class TrackerSettings:
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""
-        distortion = calibration.distortion if any(calibration.distortion) else None
-        focal, centre = (calibration.fx, calibration.fy), (calibration.cx, calibration.cy)
-        camera = Camera(focal, centre, distortion)
         accelerations = [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3
         velocities = [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3
         return make_filter(
             self.filter,
             motion=ConstantVelocity(accelerations, [0.0] * 6, velocities),
-            sensor=Pinhole(camera, self.pixel_sigma),
+            sensor=Pinhole(calibration.camera, self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),
             depth=self.depth,
