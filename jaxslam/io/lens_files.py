@@ -76,8 +76,8 @@ def of_keys(fields: dict[str, object]) -> Calibration:
     names += ["fisheye"] if _values(fields.get("fisheye_model")) == [1.0] else []  # OpenCV's flag
     distortion = _first(fields, _DISTORTION)
     if not distortion and "Camera.k1" in fields:
-        order = ("k1", "k2", "k3", "k4") if "Camera.k4" in fields else ("k1", "k2", "p1", "p2", "k3")
-        distortion = _values([fields.get(f"Camera.{x}", 0) for x in order])
+        order = "k1 k2 k3 k4" if "Camera.k4" in fields else "k1 k2 p1 p2 k3"
+        distortion = _values([fields.get(f"Camera.{x}", 0) for x in order.split()])
     model, distortion = lens(names, distortion)
     if len(size) != 2 or len(matrix) != 4:
         told = ", ".join(list(fields)[:12]) or "none"

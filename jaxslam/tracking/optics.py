@@ -44,9 +44,7 @@ def sighted(calibration: Calibration, points: Positions) -> Sight:
     return Sight(*_of_rows(_sighted, calibration, points))
 
 
-def on_pinhole(
-    calibration: Calibration, pixels: Places
-) -> tuple[Places, Bool[np.ndarray, " n"]]:
+def on_pinhole(calibration: Calibration, pixels: Places) -> tuple[Places, Bool[np.ndarray, " n"]]:
     """Where an ideal pinhole with the calibration's matrix would have these pixels, for methods
     that know no other lens, and which of them are within its view."""
     X = rays(calibration, pixels)

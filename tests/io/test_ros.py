@@ -133,8 +133,11 @@ def test_without_a_lens_it_is_guessed(tmp_path):
 
 @pytest.mark.parametrize(
     ("told", "model", "count"),
-    [("equidistant", "fisheye", 4), ("kannala_brandt", "fisheye", 4)]
-    + [("rational_polynomial", "rational", 8)],
+    [
+        ("equidistant", "fisheye", 4),
+        ("kannala_brandt", "fisheye", 4),
+        ("rational_polynomial", "rational", 8),
+    ],
 )
 def test_wide_lenses_of_a_bag_are_read(tmp_path, told, model, count):
     r, numbers = ros_of("run.bag"), tuple(np.linspace(0.1, 0.2, count).tolist())

@@ -56,7 +56,11 @@ def empty(folder):
 
 YAML = "mav0/cam0/sensor.yaml"
 REFUSED = [
-    (euroc, instead(YAML, "radial-tangential", "fov"), r"sensor\.yaml: unknown lens, pinhole fov of"),
+    (
+        euroc,
+        instead(YAML, "radial-tangential", "fov"),
+        r"yaml: unknown lens, pinhole fov of",
+    ),
     (euroc, instead(YAML, "61.5, ", ""), r"sensor\.yaml: has no image size or no camera matrix"),
     (euroc, instead(YAML, "60.5", "nan"), r"sensor\.yaml: fx must be finite, not nan"),
     (euroc, instead(YAML, "60.5", "-60.5"), r"sensor\.yaml: fx must be positive, not -60\.5"),

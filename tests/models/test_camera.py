@@ -44,7 +44,7 @@ def test_project_agrees_with_opencv(camera):
     cv2 = pytest.importorskip("cv2")
     matrix = np.diag([*camera.focal, 1.0])
     matrix[:2, 2] = camera.centre
-    numbers = np.array(jax.tree.leaves(camera.lens)) if jax.tree.leaves(camera.lens) else np.zeros(4)
+    numbers = np.array(jax.tree.leaves(camera.lens) or np.zeros(4))
     X, still = points(200), np.zeros(3)
     if isinstance(camera.lens, Fisheye):
         X[:, :2] *= 20  # up to 85° from the axis; OpenCV goes no farther than 90°
@@ -171,9 +171,12 @@ def test_projection_does_not_depend_on_the_scale_of_the_point(camera, scale):
 @pytest.mark.parametrize(
     ("camera", "point"),
     [
-        (LINE, [1.0, 0.0]), (WIDE, [1.0, 2.0, 0.0]), (IDEAL, [0.0, 0.0, 0.0]),
-        (FISHEYE, [0.0, 0.0, 0.0]), (FISHEYE, [0.0, 0.0, -1.0]),
-    ],  # fmt: skip
+        (LINE, [1.0, 0.0]),
+        (WIDE, [1.0, 2.0, 0.0]),
+        (IDEAL, [0.0, 0.0, 0.0]),
+        (FISHEYE, [0.0, 0.0, 0.0]),
+        (FISHEYE, [0.0, 0.0, -1.0]),
+    ],
     ids=["line", "wide", "ideal", "nowhere", "behind"],
 )
 def test_derivative_where_nothing_is_seen_is_finite(camera, point, mode):
