@@ -9,11 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, write_json
-from jaxslam.models.camera import Camera
-from jaxslam.models.lens import LENSES, Ideal
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _KEYS = ("width", "height", *INTRINSICS)
+MODELS = {
+    "pinhole": "k1 k2 p1 p2 k3",
+    "rational": "k1 k2 p1 p2 k3 k4 k5 k6",
+    "fisheye": "k1 k2 k3 k4",
+}
+"""The numbers of every model's lens, in order (`jaxslam.models.lens`)."""
 GUESSED_FIELD_OF_VIEW = 65.0
 """Degrees along the longer side: between a phone that films and a webcam."""
 _GUESSED_SHARE, _TOLD_SHARE, _CENTRE_SHARE = 0.15, 0.05, 0.02
@@ -26,10 +30,10 @@ class Calibration:
     """Intrinsics and lens of a camera, for one image size.
 
     `width`, `height`, `fx`, `fy`, `cx`, `cy` are in pixels, the centre of the first pixel is
-    (0, 0); `distortion` holds the numbers (no unit) of the lens that `model` names in
-    `jaxslam.models.lens.LENSES`, of a pinhole OpenCV's k1, k2, p1, p2, k3; a shorter one is padded
-    with zeros. `sigma` are standard deviations of fx, fy, cx, cy, pixels; none where they
-    are unknown. A `guessed` one has square pixels, so that fx and fy are off by one number.
+    (0, 0); `distortion` holds the numbers (no unit) of the lens, which `MODELS` names by its
+    `model`: of a pinhole OpenCV's k1, k2, p1, p2, k3. A shorter one is padded with zeros. `sigma`
+    are standard deviations of fx, fy, cx, cy, pixels; none where they are unknown. A `guessed` one
+    has square pixels, so that fx and fy are off by one number.
     Raises `ValueError` for numbers that cannot be a camera's.
     """
 
@@ -59,13 +63,6 @@ class Calibration:
                 raise ValueError(f"{key} must be positive, not {getattr(self, key)}")
         object.__setattr__(self, "distortion", _padded(self.model, self.distortion))
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
-
-    @property
-    def camera(self) -> Camera:
-        """What projects points of the camera frame, by the same numbers."""
-        ideal = self.model == "pinhole" and not any(self.distortion)
-        lens = Ideal() if ideal else LENSES[self.model](*self.distortion)
-        return Camera((self.fx, self.fy), (self.cx, self.cy), lens)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -166,9 +163,9 @@ def _checked_sigma(sigma: Sequence[float]) -> tuple[float, ...]:
 
 
 def _padded(model: str, distortion: Sequence[float]) -> tuple[float, ...]:
-    if model not in LENSES:
-        raise ValueError(f"unknown camera model {model!r}; expected {', '.join(LENSES)}")
-    names = LENSES[model].__dataclass_fields__
+    if model not in MODELS:
+        raise ValueError(f"unknown camera model {model!r}; expected {', '.join(MODELS)}")
+    names = MODELS[model].split()
     if len(distortion) > len(names):
         raise ValueError(
             f"distortion has {len(distortion)} entries; expected at most {', '.join(names)}"

@@ -157,7 +157,7 @@ LENSES: dict[str, type[AbstractLens]] = {
     "rational": Rational,
     "fisheye": Fisheye,
 }
-"""Lenses by the `model` of a calibration file, whose `distortion` has their numbers in order."""
+"""Lenses by the `model` of a calibration file."""
 
 
 def _with_tangential(flat: Place, radial: Scalar, p1: Number, p2: Number) -> Place:

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam._runtime.programs import Program
-from jaxslam.io.calibration import Calibration
+from jaxslam.io.calibration import MODELS, Calibration
 from jaxslam.models.camera import Camera, project, ray
+from jaxslam.models.lens import LENSES, Ideal
 from jaxslam.tracking.patches import Places
 from jaxslam.tracking.pose_with_covariance import Positions
 
@@ -23,7 +24,7 @@ STEEP = 0.4
 lies beyond has errors there that are many times those of its pixel."""
 
 
-class Sight(NamedTuple):
+class Sighted(NamedTuple):
     """What a lens makes of points in the camera frame."""
 
     pixels: Float[np.ndarray, "n 2"]
@@ -33,15 +34,23 @@ class Sight(NamedTuple):
     """Whether the lens sees it."""
 
 
+def camera_of(calibration: Calibration) -> Camera:
+    """The camera with a calibration's numbers."""
+    c, names = calibration, MODELS[calibration.model].split()
+    lens = LENSES[c.model](**dict(zip(names, c.distortion, strict=True)))
+    plain = c.model == "pinhole" and not any(c.distortion)
+    return Camera((c.fx, c.fy), (c.cx, c.cy), Ideal() if plain else lens)
+
+
 def rays(calibration: Calibration, pixels: Places) -> Positions:
     """The points of depth 1 that pixels show."""
     return _of_rows(_rays, calibration, pixels)
 
 
-def sighted(calibration: Calibration, points: Positions) -> Sight:
+def sighted(calibration: Calibration, points: Positions) -> Sighted:
     """What the lens makes of points in the camera frame, which may be numerators of homogeneous
     ones."""
-    return Sight(*_of_rows(_sighted, calibration, points))
+    return Sighted(*_of_rows(_sighted, calibration, points))
 
 
 def on_pinhole(calibration: Calibration, pixels: Places) -> tuple[Places, Bool[np.ndarray, " n"]]:
@@ -50,7 +59,7 @@ def on_pinhole(calibration: Calibration, pixels: Places) -> tuple[Places, Bool[n
     X = rays(calibration, pixels)
     within = X[:, 2] > STEEP * np.linalg.norm(X, axis=1)
     flat = X[:, :2] / np.where(within, X[:, 2], 1.0)[:, None]
-    camera = calibration.camera
+    camera = camera_of(calibration)
     return flat * camera.focal + camera.centre, within
 
 
@@ -72,16 +81,10 @@ def _sighted(camera: Camera, points: jax.Array) -> tuple[jax.Array, ...]:
     return jax.vmap(one)(points)
 
 
-def compile_optics(calibration: Calibration) -> None:
-    """Compile the programs for few rows."""
-    _rays.compile(calibration.camera, np.zeros((LEAST, 2)))
-    _sighted.compile(calibration.camera, np.zeros((LEAST, 3)))
-
-
 def _of_rows(program: Program, calibration: Calibration, rows: np.ndarray) -> PyTree:
     size = max(LEAST, 1 << (len(rows) - 1).bit_length())
     padded = np.ones((size, rows.shape[1]))
     padded[: len(rows)] = rows
     with jax.enable_x64(True):
-        found = jax.device_get(program(calibration.camera, padded))
+        found = jax.device_get(program(camera_of(calibration), padded))
     return jax.tree.map(lambda x: x[: len(rows)], found)

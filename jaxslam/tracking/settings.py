@@ -17,6 +17,7 @@ from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
+from jaxslam.tracking.optics import camera_of
 
 FIT = 36.0
 """The variance of a match by what it would be if its window's residual were white: distances from
@@ -125,7 +126,7 @@ class TrackerSettings:
         return make_filter(
             self.filter,
             motion=ConstantVelocity(accelerations, [0.0] * 6, velocities),
-            sensor=Pinhole(calibration.camera, self.pixel_sigma),
+            sensor=Pinhole(camera_of(calibration), self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),
             depth=self.depth,
