@@ -6,8 +6,6 @@ differentiated. Pixels are (u,) or (u, v); points are (x, z) or (x, y, z) in the
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -37,20 +35,24 @@ class Camera(eqx.Module):
 
     @property
     def intrinsics(self) -> Float[Array, " k"]:
-        """(f, c) of the 1-D camera, (fx, fy, cx, cy) of the 2-D one, in pixels."""
-        return jnp.concatenate([self.focal, self.centre])
+        """(f, c) of the 1-D camera, (fx, fy, cx, cy) of the 2-D one, in pixels; then the lens's k1
+        and k2, if it has any."""
+        lens = map(jnp.atleast_1d, self.lens.coefficients)
+        return jnp.concatenate([self.focal, self.centre, *lens])
 
     def perturbed(self, delta: Float[Array, " k"]) -> Camera:
         """The camera with its intrinsics moved by δ; an empty δ means that they are known.
 
-        Of a 2-D camera δ may also be of (f, cx, cy): fx and fy are off by the same number.
+        δ is of (f, c), of (fx, fy, cx, cy), or of (f, cx, cy), where fx and fy are off by the same
+        number; then, where the lens is not known, of its k1 and k2. Raises ValueError for others.
         """
         if delta.size == 0:
             return self
-        if delta.size == 3 and np.shape(self.focal) == (2,):
-            delta = delta[jnp.array([0, 0, 1, 2])]
-        focal, centre = jnp.split(self.intrinsics + delta, 2)
-        return replace(self, focal=focal, centre=centre)
+        count = np.shape(self.focal)[0]
+        if count == 2 and delta.size % 2:
+            delta = jnp.append(delta[:1], delta)
+        focal, centre, of_lens = jnp.split(delta, [count, 2 * count])
+        return Camera(self.focal + focal, self.centre + centre, self.lens.perturbed(of_lens))
 
 
 def project(camera: Camera, point: Point) -> Pixel:

@@ -2,12 +2,13 @@
 
 A lens lays directions out on a plane, x/z of a perspective one and the angle from the axis of a
 fisheye, and bends that plane by its coefficients. One of your own is one class with the functions
-of `AbstractLens`, of which only `bent` must be written.
+of `AbstractLens`, or with that of `AbstractBent`.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -27,12 +28,30 @@ class AbstractLens(eqx.Module):
     """A lens, by default a perspective one, whose rays have z = 1."""
 
     @abstractmethod
-    def bent(self, flat: Place) -> Place:
-        """Where the lens shows what an ideal one of its kind would show there."""
+    def distort(self, point: Point) -> Place:
+        """Where the lens shows a point; meaningless of one that it does not see."""
+
+    @abstractmethod
+    def undistort(self, place: Place) -> Point:
+        """The inverse of `distort`: the point of depth 1 that is seen there."""
+
+    @property
+    def coefficients(self) -> tuple[Number, ...]:
+        """k1 and k2, which may be uncertain; none of a lens without."""
+        return ()
+
+    def perturbed(self, delta: Float[Array, " k"]) -> AbstractLens:
+        """The lens with its coefficients moved by δ; of an empty δ, the lens itself.
+
+        Raises ValueError for any other δ of a lens without.
+        """
+        if delta.size:
+            raise ValueError(f"{type(self).__name__} has no coefficients that could be uncertain")
+        return self
 
     def flat(self, point: Point) -> Place:
-        """Where an ideal lens shows a point of the camera frame: x/z. The scale of the point does
-        not matter. At z = 0 the result and its derivative are finite but meaningless."""
+        """Where an ideal lens of the kind shows a point: x/z. The scale of the point does not
+        matter. At z = 0 the result and its derivative are finite but meaningless."""
         return point[:-1] / jnp.where(point[-1] == 0, 1.0, point[-1])
 
     def ray(self, flat: Place) -> Point:
@@ -44,43 +63,61 @@ class AbstractLens(eqx.Module):
         return point[-1]
 
     def sees(self, point: Point) -> Bool[Array, ""]:
-        """Whether the lens shows the point: before the camera, and nowhere beyond the angle from
-        which on the model would fold the picture back."""
-        return (point[-1] > 0) & self.unfolded(self.flat(point))
+        """Whether the lens shows the point: before the camera."""
+        return point[-1] > 0
+
+
+class Ideal(AbstractLens):
+    """`x/z`: no distortion; of any dimension."""
 
     def distort(self, point: Point) -> Place:
-        """Where the lens shows a point; meaningless of one that it does not see."""
+        return self.flat(point)
+
+    def undistort(self, place: Place) -> Point:
+        return self.ray(place)
+
+
+class AbstractBent(AbstractLens):
+    """A lens that bends the plane of an ideal one of its kind."""
+
+    k1: Float[AnyArray, ""] = number_field(default=0.0)
+    k2: Float[AnyArray, ""] = number_field(default=0.0)
+
+    @abstractmethod
+    def bent(self, flat: Place) -> Place:
+        """Where the lens shows what an ideal one would show there."""
+
+    @property
+    def coefficients(self) -> tuple[Number, ...]:
+        return self.k1, self.k2
+
+    def perturbed(self, delta: Float[Array, " k"]) -> AbstractLens:
+        """Raises ValueError for a δ of more or fewer than k1 and k2."""
+        if delta.size == 0:
+            return self
+        dk1, dk2 = delta
+        return replace(self, k1=self.k1 + dk1, k2=self.k2 + dk2)
+
+    def distort(self, point: Point) -> Place:
         return self.bent(self.flat(point))
 
-    def undistort(self, bent: Place) -> Point:
-        """The inverse of `distort`, of depth 1, by Newton's method; meaningless beyond the part of
-        the plane that the model maps."""
-        return self.ray(_straightened(self, bent))
+    def undistort(self, place: Place) -> Point:
+        """By Newton's method; meaningless beyond the part of the plane that the model maps."""
+        return self.ray(_straightened(self, place))
+
+    def sees(self, point: Point) -> Bool[Array, ""]:
+        """Before the camera, and nowhere beyond the angle from which on the model would fold the
+        picture back."""
+        return (point[-1] > 0) & self.unfolded(self.flat(point))
 
     def unfolded(self, flat: Place) -> Bool[Array, ""]:
         """Whether what is farther out there is shown farther out."""
         return jax.jvp(self.bent, (flat,), (flat,))[1] @ flat >= 0
 
 
-class Ideal(AbstractLens):
-    """`x/z`: no distortion; of any dimension."""
-
-    def bent(self, flat: Place) -> Place:
-        return flat
-
-    def undistort(self, bent: Place) -> Point:
-        return self.ray(bent)
-
-    def unfolded(self, flat: Place) -> Bool[Array, ""]:
-        del flat
-        return jnp.ones((), bool)
-
-
-class RadialTangential(AbstractLens):
+class RadialTangential(AbstractBent):
     """OpenCV's five numbers, ROS's `plumb_bob`, Kalibr's `radtan` (Brown, 1966)."""
 
-    k1: Float[AnyArray, ""] = number_field(default=0.0)
-    k2: Float[AnyArray, ""] = number_field(default=0.0)
     p1: Float[AnyArray, ""] = number_field(default=0.0)
     p2: Float[AnyArray, ""] = number_field(default=0.0)
     k3: Float[AnyArray, ""] = number_field(default=0.0)
@@ -92,11 +129,9 @@ class RadialTangential(AbstractLens):
         return _with_tangential(flat, radial, self.p1, self.p2)
 
 
-class Rational(AbstractLens):
+class Rational(AbstractBent):
     """OpenCV's eight numbers, ROS's `rational_polynomial`, for wide lenses."""
 
-    k1: Float[AnyArray, ""] = number_field(default=0.0)
-    k2: Float[AnyArray, ""] = number_field(default=0.0)
     p1: Float[AnyArray, ""] = number_field(default=0.0)
     p2: Float[AnyArray, ""] = number_field(default=0.0)
     k3: Float[AnyArray, ""] = number_field(default=0.0)
@@ -112,12 +147,10 @@ class Rational(AbstractLens):
         return _with_tangential(flat, radial, self.p1, self.p2)
 
 
-class Fisheye(AbstractLens):
+class Fisheye(AbstractBent):
     """Kannala and Brandt's (TPAMI 2006), OpenCV's `fisheye`, Kalibr's `equi`: an equidistant lens,
     which may see more than a half-space. Its rays have unit length, and depth is the distance."""
 
-    k1: Float[AnyArray, ""] = number_field(default=0.0)
-    k2: Float[AnyArray, ""] = number_field(default=0.0)
     k3: Float[AnyArray, ""] = number_field(default=0.0)
     k4: Float[AnyArray, ""] = number_field(default=0.0)
 
@@ -147,8 +180,8 @@ class Fisheye(AbstractLens):
         return jnp.linalg.norm(point)
 
     def sees(self, point: Point) -> Bool[Array, ""]:
-        """Whether the lens shows the point: not within 8° of straight behind it, where directions
-        have no place, and not beyond the angle from which on the model would fold back."""
+        """Not within 8° of straight behind, where directions have no place, and nowhere beyond the
+        angle from which on the model would fold the picture back."""
         return (point[-1] > -0.99 * self.depth(point)) & self.unfolded(self.flat(point))
 
 
@@ -166,7 +199,7 @@ def _with_tangential(flat: Place, radial: Scalar, p1: Number, p2: Number) -> Pla
 
 
 @jax.custom_jvp
-def _straightened(lens: AbstractLens, bent: Place) -> Place:
+def _straightened(lens: AbstractBent, bent: Place) -> Place:
     def step(flat, _):
         return flat - _undone(lens, flat, lens.bent(flat) - bent), None
 
@@ -182,7 +215,7 @@ def _(primals, tangents):
     return flat, _undone(lens, flat, moved - changed)
 
 
-def _undone(lens: AbstractLens, flat: Place, change: Place) -> Place:
+def _undone(lens: AbstractBent, flat: Place, change: Place) -> Place:
     """By how much the ideal place changes where the distorted one does so: J⁻¹ of the change."""
     (a, b), (c, d) = jax.jacfwd(lens.bent)(flat)
     by = jnp.stack([d * change[0] - b * change[1], a * change[1] - c * change[0]])

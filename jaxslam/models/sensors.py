@@ -179,7 +179,7 @@ class Pinhole(AbstractSensor):
         return self.camera.focal[..., 0]
 
     def perturbed(self, delta: Float[Array, " k"]) -> "Pinhole":
-        """Intrinsics moved by δ, of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (P15)."""
+        """Intrinsics moved by δ, as `Camera.perturbed` has it (P15)."""
         return replace(self, camera=self.camera.perturbed(delta))
 
 

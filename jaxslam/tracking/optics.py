@@ -35,10 +35,10 @@ class Sighted(NamedTuple):
 
 
 def camera_of(calibration: Calibration) -> Camera:
-    """The camera with a calibration's numbers."""
+    """The camera with a calibration's numbers; a guessed one's may turn out to be distorted."""
     c, names = calibration, MODELS[calibration.model].split()
     lens = LENSES[c.model](**dict(zip(names, c.distortion, strict=True)))
-    plain = c.model == "pinhole" and not any(c.distortion)
+    plain = c.model == "pinhole" and not (c.guessed or any(c.distortion))
     return Camera((c.fx, c.fy), (c.cx, c.cy), Ideal() if plain else lens)
 
 

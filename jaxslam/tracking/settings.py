@@ -11,7 +11,7 @@ from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.words import FILTERS, make_filter
-from jaxslam.io.calibration import Calibration
+from jaxslam.io.calibration import LENS_SIGMA, Calibration
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
 from jaxslam.models.depth import InverseDepth
@@ -137,4 +137,4 @@ class TrackerSettings:
         these."""
         name = self.calibration or ("estimated" if calibration.guessed else "known")
         sigma = list(calibration.sigma) or ([self.focal_sigma] * 2 + [self.centre_sigma] * 2)
-        return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)
+        return TREATMENTS[name]([*sigma[1:], *LENS_SIGMA] if calibration.guessed else sigma)

@@ -188,7 +188,7 @@ def test_derivative_where_nothing_is_seen_is_finite(camera, point, mode):
 def test_perturbed_moves_the_intrinsics_and_keeps_the_lens():
     delta = jnp.array([1.0, -2.0, 3.0, -4.0])
     moved = WIDE.perturbed(delta)
-    np.testing.assert_array_equal(moved.intrinsics, WIDE.intrinsics + delta)
+    np.testing.assert_array_equal(moved.intrinsics[:4], WIDE.intrinsics[:4] + delta)
     assert moved.lens == WIDE.lens
     # u = f d(x/z) + c: by hand, what the shift of f and c does to a pixel.
     X = jnp.asarray(points(1)[0])
@@ -196,6 +196,31 @@ def test_perturbed_moves_the_intrinsics_and_keeps_the_lens():
     np.testing.assert_allclose(
         project(moved, X) - project(WIDE, X), delta[:2] * d + delta[2:], rtol=0, atol=1e-10
     )
+
+
+@pytest.mark.parametrize("camera", [WIDE, RATIONAL, FISHEYE], ids=["wide", "rational", "fisheye"])
+@pytest.mark.parametrize("delta", [[3.0, -1, 2, 0.05, -0.02], [3.0, 3, -1, 2, 0.05, -0.02]])
+def test_perturbed_moves_k1_and_k2_of_a_lens_that_is_not_known(camera, delta):
+    moved = camera.perturbed(jnp.array(delta))
+    change = np.array([3.0, 3, -1, 2, 0.05, -0.02])
+    np.testing.assert_allclose(moved.intrinsics, camera.intrinsics + change, rtol=1e-15)
+    others = jax.tree.leaves(moved.lens)[2:]
+    assert others == jax.tree.leaves(camera.lens)[2:]
+    # By hand: u = f (d + Δ(k1 r² + k2 r⁴) x) + c of a lens without another denominator.
+    if camera is not RATIONAL:
+        X = jnp.array([0.3, -0.2, 1.0])
+        x = camera.lens.flat(X)
+        bent = camera.lens.distort(X) + x * (0.05 * x @ x - 0.02 * (x @ x) ** 2)
+        expected = moved.focal * bent + moved.centre
+        np.testing.assert_allclose(project(moved, X), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("delta", [[1.0, 2, 3, 4, 5, 6], [1.0, 2, 3, 4, 5]])
+def test_an_ideal_lens_has_no_k1(delta):
+    with pytest.raises(ValueError, match="Ideal has no coefficients that could be uncertain"):
+        IDEAL.perturbed(jnp.array(delta))
+    with pytest.raises(ValueError, match="too many values"):
+        WIDE.perturbed(jnp.ones(7))
 
 
 def test_an_empty_perturbation_means_a_known_camera():
