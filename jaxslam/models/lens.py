@@ -81,7 +81,9 @@ class AbstractBent(AbstractLens):
     """A lens that bends the plane of an ideal one of its kind."""
 
     k1: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r² (of a fisheye, θ²), no unit."""
     k2: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r⁴ (θ⁴)."""
 
     @abstractmethod
     def bent(self, flat: Place) -> Place:
@@ -119,8 +121,11 @@ class RadialTangential(AbstractBent):
     """OpenCV's five numbers, ROS's `plumb_bob`, Kalibr's `radtan` (Brown, 1966)."""
 
     p1: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of the tangential part."""
     p2: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of the tangential part."""
     k3: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r⁶."""
 
     def bent(self, flat: Place) -> Place:
         """`x (1 + k1 r² + k2 r⁴ + k3 r⁶ + 2 s·x) + s r²` with s = (p2, p1)."""
@@ -133,11 +138,17 @@ class Rational(AbstractBent):
     """OpenCV's eight numbers, ROS's `rational_polynomial`, for wide lenses."""
 
     p1: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of the tangential part."""
     p2: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of the tangential part."""
     k3: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r⁶."""
     k4: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r², in the denominator."""
     k5: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r⁴, in the denominator."""
     k6: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of r⁶, in the denominator."""
 
     def bent(self, flat: Place) -> Place:
         """As `RadialTangential`, its polynomial divided by `1 + k4 r² + k5 r⁴ + k6 r⁶`."""
@@ -152,7 +163,9 @@ class Fisheye(AbstractBent):
     which may see more than a half-space. Its rays have unit length, and depth is the distance."""
 
     k3: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of θ⁶."""
     k4: Float[AnyArray, ""] = number_field(default=0.0)
+    """Of θ⁸."""
 
     def bent(self, flat: Place) -> Place:
         """`x (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, θ = |x|."""
