@@ -20,8 +20,9 @@ CLEAR = 0.8
 """The share of the squares that is left where another lens fits clearly better."""
 _STRETCHES, _SPAN, _VIEWS = 3, 100, 10  # of the video, in frames, and of each stretch
 _STEPS, _LOOSE = 25, 1.5  # of Levenberg and Marquardt; Cauchy's loss, pixels
-_PRIOR = 0.3**-2 * np.eye(2)
-"""Of the logarithm of the focal length and of k1, in squared pixels: where nothing tells them."""
+_PRIOR = 0.3
+"""σ of the logarithm of the focal length and of k1 where nothing tells them, with that of a pixel
+for a unit."""
 
 
 class BetterLens(NamedTuple):
@@ -52,7 +53,7 @@ class BetterLens(NamedTuple):
 def better_lens(history: Sequence[Tracked], points: Points, calibration: Calibration) -> BetterLens:
     """Adjust views of three stretches of the video with the points that they share, from where the
     tracker has both, with the lens that was given and with focal length and k1 free."""
-    squares, information, weighed = np.zeros(2), _PRIOR, np.zeros(2)
+    squares, information, weighed = np.zeros(2), np.eye(2) / _PRIOR**2, np.zeros(2)
     for first in np.unique(np.linspace(0, max(len(history) - _SPAN, 0), _STRETCHES).astype(int)):
         last = min(first + _SPAN, len(history)) - 1
         chosen = [history[i] for i in np.unique(np.linspace(first, last, _VIEWS).astype(int))]
@@ -61,8 +62,7 @@ def better_lens(history: Sequence[Tracked], points: Points, calibration: Calibra
         if 2 * len(bundle.view) > 1.2 * (6 * len(bundle.shifts) + bundle.places.size):
             told, free = (bundle.adjusted(freed=freed) for freed in (0.0, 1.0))
             squares += told.left, free.left
-            known = free.of_lens()
-            information, weighed = information + known, weighed + known @ free.bundle.lens
+            information, weighed = information + free.known, weighed + free.known @ free.bundle.lens
     if not squares[0]:
         return BetterLens(1.0, 0.0, np.full(2, np.inf), 1.0)
     covariance = np.linalg.inv(information)
@@ -117,87 +117,73 @@ class _Bundle(NamedTuple):
         distortion = (c.distortion[0] + more, *c.distortion[1:])
         return replace(c, fx=c.fx * times, fy=c.fy * times, distortion=distortion)
 
-    def less(self, step: Float[np.ndarray, " c"], by_places: Float[np.ndarray, "p 3"]) -> _Bundle:
-        """The bundle without a step, of turn and shift of every view and of the lens."""
-        of_views = step[:-2].reshape(-1, 6)
-        nudges = np.array([cv2.Rodrigues(-turn)[0] for turn in of_views[:, :3]])
+    def less(self, step: Float[np.ndarray, " c"]) -> _Bundle:
+        """The bundle without a step, of turn and shift of every view, of the lens and of places."""
+        of_views, of_lens, of_places = np.split(
+            step, [self.shifts.size * 2, self.shifts.size * 2 + 2]
+        )
+        turns, shifts = np.split(of_views.reshape(-1, 6), 2, axis=1)
+        nudges = np.array([cv2.Rodrigues(-turn)[0] for turn in turns])
         return self._replace(
-            turns=nudges @ self.turns, shifts=self.shifts - of_views[:, 3:],
-            places=self.places - by_places, lens=self.lens - step[-2:],
+            turns=nudges @ self.turns, shifts=self.shifts - shifts, lens=self.lens - of_lens,
+            places=self.places - of_places.reshape(-1, 3),
         )  # fmt: skip
 
     def adjusted(self, *, freed: float) -> _Linear:
         """What Levenberg and Marquardt reach, with the lens `freed` (1) or as it is (0)."""
         now, damping = _Linear.at(self, freed), 1e-3
         for _ in range(_STEPS):
-            tried = _Linear.at(now.bundle.less(*now.step(damping)), freed)
+            H = now.by.T @ now.by
+            H += np.diag(damping * np.diagonal(H) + 1e-9)
+            tried = _Linear.at(now.bundle.less(np.linalg.solve(H, now.by.T @ now.off)), freed)
+            done = 0 <= now.left - tried.left < 1e-3 * now.left
             now, damping = (tried, damping / 10) if tried.left < now.left else (now, 10 * damping)
+            if done:
+                break
         return now
 
 
 class _Linear(NamedTuple):
-    """The sum of squares by Cauchy's loss at a bundle, half its gradient and its Hessian after
-    Gauss, by c numbers of views and lens and by places."""
+    """The sum of squares by Cauchy's loss at a bundle, and what is squared and its Jacobian, by
+    views, lens and places, as that loss weighs them."""
 
     bundle: _Bundle
     left: float
-    by_numbers: Float[np.ndarray, " c"]
-    by_places: Float[np.ndarray, "p 3"]
-    of_numbers: Float[np.ndarray, "c c"]
-    of_places: Float[np.ndarray, "p 3 3"]
-    of_both: Float[np.ndarray, "p c 3"]
+    off: Float[np.ndarray, " r"]
+    by: Float[np.ndarray, "r c"]
 
     @classmethod
     def at(cls, bundle: _Bundle, freed: float) -> _Linear:
-        v, n = len(bundle.shifts), len(bundle.view)
-        turned = np.einsum("nij,nj->ni", bundle.turns[bundle.view], bundle.places[bundle.place])
-        X, h = turned + bundle.shifts[bundle.view], 1e-4
+        v, p, n = len(bundle.shifts), len(bundle.places), len(bundle.view)
+        R, h = bundle.turns[bundle.view], 1e-4
+        turned = np.einsum("nij,nj->ni", R, bundle.places[bundle.place])
+        X = turned + bundle.shifts[bundle.view]
         seen, slopes, _ = sighted(bundle.camera(), X)
         more, fewer = (sighted(bundle.camera(k1), X).pixels for k1 in (h, -h))
-        slopes, centre = slopes[:, :2], (bundle.given.cx, bundle.given.cy)
-        off = seen - bundle.pixels
-        far = np.sum(off**2, axis=1) / _LOOSE**2
-        A = np.zeros((n, 2, 6 * v + 2))
-        places = 6 * bundle.view[:, None] + np.arange(6)
-        by_turn = np.cross(turned[:, None], slopes)
-        of_view = np.concatenate([by_turn, slopes], axis=2)
-        A[np.arange(n)[:, None, None], np.arange(2)[:, None], places[:, None]] = of_view
-        A[..., -2:] = freed * np.stack([seen - centre, (more - fewer) / (2 * h)], axis=2)
-        B = slopes @ bundle.turns[bundle.view]
-        weights = 1 / (1 + far)[:, None, None]
-        both = np.zeros((len(bundle.places), 6 * v + 2, 3))
-        of_places, by_places = np.zeros((len(both), 3, 3)), np.zeros((len(both), 3))
-        WA, WB = (np.swapaxes(weights * x, 1, 2) for x in (A, B))
-        np.add.at(both, bundle.place, WA @ B)
-        np.add.at(of_places, bundle.place, WB @ B)
-        np.add.at(by_places, bundle.place, (WB @ off[..., None])[..., 0])
-        of_numbers = np.einsum("nki,nkj->ij", weights * A, A)
-        by_numbers = np.einsum("nki,nk->i", weights * A, off)
-        of_numbers[-2:, -2:] += _PRIOR
-        by_numbers[-2:] += _PRIOR @ bundle.lens
-        left = float(_LOOSE**2 * np.log1p(far).sum() + bundle.lens @ _PRIOR @ bundle.lens)
-        return cls(bundle, left, by_numbers, by_places, of_numbers, of_places, both)
+        off, slopes = seen - bundle.pixels, slopes[:, :2]
+        far = np.sum(off**2, axis=1, keepdims=True) / _LOOSE**2
+        by = np.zeros((n, 2, 6 * v + 2 + 3 * p))
+        by_view = np.concatenate([np.cross(turned[:, None], slopes), slopes], axis=2)
+        centre = bundle.given.cx, bundle.given.cy
+        by_lens = freed * np.stack([seen - centre, (more - fewer) / (2 * h)], axis=2)
+        for first, block in (
+            (6 * bundle.view, by_view),
+            (np.full(n, 6 * v), by_lens),
+            (6 * v + 2 + 3 * bundle.place, slopes @ R),
+        ):
+            columns = first[:, None] + np.arange(block.shape[2])
+            by[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = block
+        prior = np.eye(2, by.shape[2], 6 * v) / _PRIOR
+        weights = 1 / np.sqrt(1 + far)
+        off = np.append(weights * off, bundle.lens / _PRIOR)
+        by = np.concatenate([(weights[..., None] * by).reshape(2 * n, -1), prior])
+        left = _LOOSE**2 * np.log1p(far).sum() + np.sum((bundle.lens / _PRIOR) ** 2)
+        return cls(bundle, float(left), off, by)
 
-    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hessian and gradient by views and lens, of which the places make the best (Schur)."""
-        of_numbers, of_places = (
-            H + np.eye(H.shape[-1]) * (damping * H + 1e-9)
-            for H in (self.of_numbers, self.of_places)
-        )
-        gain = self.of_both @ np.linalg.inv(of_places)
-        H = of_numbers - np.einsum("pci,pdi->cd", gain, self.of_both)
-        return H, self.by_numbers - np.einsum("pci,pi->c", gain, self.by_places), of_places
-
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """What Levenberg and Marquardt subtract."""
-        H, gradient, of_places = self.reduced(damping)
-        of_number = np.linalg.solve(H, gradient)
-        rest = self.by_places - np.einsum("pci,c->pi", self.of_both, of_number)
-        return of_number, np.linalg.solve(of_places, rest[..., None])[..., 0]
-
-    def of_lens(self) -> Float[np.ndarray, "2 2"]:
+    @property
+    def known(self) -> Float[np.ndarray, "2 2"]:
         """What the matches tell of the lens: the inverse of its covariance."""
-        H, _, _ = self.reduced(1e-6)
-        variance = self.left / max(2 * len(self.bundle.view) - len(H) - self.bundle.places.size, 1)
-        covariance = np.linalg.inv(H)[-2:, -2:]
-        return np.linalg.inv(covariance) / variance
+        H, place = self.by.T @ self.by, 2 * self.bundle.shifts.size
+        covariance = np.linalg.inv(H + np.diag(1e-6 * np.diagonal(H) + 1e-9))
+        variance = self.left / max(len(self.by) - len(H), 1)
+        return np.linalg.inv(variance * covariance[place : place + 2, place : place + 2])
