@@ -8,6 +8,7 @@ levels against aliasing. Axes are a camera's: x to the right, y down, z forward.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Image, Source, Trajectory
+from jaxslam.tracking.optics import rays
 from jaxslam.tracking.synthetic import add_noise
 
 SIZE = 512
@@ -78,15 +80,13 @@ def render(
     `sky` is the grey level where no body is. The centre of pixel (u, v) is at (u, v).
     """
     (w, h), n = (calibration.width, calibration.height), samples
-    x = ((np.arange(n * w) + 0.5) / n - 0.5 - calibration.cx) / calibration.fx
-    y = ((np.arange(n * h) + 0.5) / n - 0.5 - calibration.cy) / calibration.fy
-    rays = x.astype(np.float32), y.astype(np.float32)
+    rays, coarse = _rays(calibration, n)
     depth = np.full((n * h, n * w), np.inf, np.float32)
     owner = np.full(depth.shape, -1, np.int16)
-    parts = [_part(body, T_wc, calibration, n) for body in bodies]
+    parts = [_part(body, T_wc, coarse) for body in bodies]
     for number, (body, part) in enumerate(zip(bodies, parts, strict=True)):
         if part is not None:
-            t = _hit(body, T_wc, rays[0][part[1]], rays[1][part[0]])
+            t = _hit(body, T_wc, rays[part])
             nearer = t < depth[part]
             depth[part][nearer] = t[nearer]
             owner[part][nearer] = number
@@ -95,9 +95,8 @@ def render(
         if part is not None:
             row, column = np.nonzero(owner[part] == number)
             if len(row):
-                t = depth[part][row, column]
-                seen = rays[0][part[1]][column], rays[1][part[0]][row], t
-                grey[part][row, column] = _shade(body, T_wc, seen, n * calibration.fx)
+                seen = rays[part][row, column], depth[part][row, column]
+                grey[part][row, column] = _shade(body, T_wc, *seen, n * calibration.fx)
     return cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA)
 
 
@@ -106,30 +105,44 @@ def as_image(grey: Float[np.ndarray, "h w"]) -> Image:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def _part(body: Body, T_wc, calibration: Calibration, n: int) -> tuple[slice, slice] | None:
+_APART = 8
+"""Rays from one to the next of those that tell which may hit a body."""
+
+
+@cache
+def _rays(calibration: Calibration, n: int) -> tuple[Float[np.ndarray, "h w 3"], np.ndarray]:
+    """The rays of n² samples a pixel, by the lens; and some of them, of unit length."""
+    v, u = (np.mgrid[: n * calibration.height, : n * calibration.width] + 0.5) / n - 0.5
+    found = rays(calibration, np.stack([u.ravel(), v.ravel()], 1)).astype(np.float32)
+    found = found.reshape(*u.shape, 3)
+    coarse = found[::_APART, ::_APART]
+    return found, coarse / np.linalg.norm(coarse, axis=2, keepdims=True)
+
+
+def _part(body: Body, T_wc, coarse: Float[np.ndarray, "h w 3"]) -> tuple[slice, slice] | None:
     """Rows and columns of rays that may hit the body; None where none does."""
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    corners = signs * np.asarray(body.half) @ to_body(body) + np.asarray(body.centre)
-    x, y, z = ((corners - T_wc[:3, 3]) @ T_wc[:3, :3]).T
-    if z.max() < _NEAR:
-        return None
-    if z.min() < _NEAR:
+    to_centre = (np.asarray(body.centre) - T_wc[:3, 3]) @ T_wc[:3, :3]
+    away = np.linalg.norm(to_centre)
+    reach = float(np.linalg.norm(body.half)) if not body.sphere else body.half[0]
+    if reach >= away:
         return slice(None), slice(None)
-    u, v = calibration.fx * x / z + calibration.cx, calibration.fy * y / z + calibration.cy
-    (left, right), (top, bottom) = (
-        (max(int(n * p.min()) - n, 0), min(int(n * p.max()) + 2 * n, n * size))
-        for p, size in ((u, calibration.width), (v, calibration.height))
+    apart = np.arccos(np.sum(coarse[:-1] * coarse[1:], axis=2).min())
+    least = np.cos(min(np.arcsin(reach / away) + 1.5 * apart, np.pi))
+    near = coarse @ (to_centre / away).astype(np.float32) >= least
+    if not near.any():
+        return None
+    return tuple(
+        slice(max(int(hit[0]) - 1, 0) * _APART, (int(hit[-1]) + 2) * _APART)
+        for hit in (np.flatnonzero(near.any(axis=1 - axis)) for axis in (0, 1))
     )
-    return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))
 
 
-def _hit(body: Body, T_wc, x, y) -> Float[np.ndarray, "h w"]:
-    """Depths z at which rays (x, y, 1) enter the body, or leave it where the camera is inside;
+def _hit(body: Body, T_wc, rays: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """In how many times their length rays enter the body, or leave it where the camera is inside;
     infinite where they do not."""
     turn = to_body(body)
     start = (turn @ (T_wc[:3, 3] - np.asarray(body.centre))).astype(np.float32)
-    across, down, ahead = (turn @ T_wc[:3, :3]).astype(np.float32).T
-    ways = [(across[k] * x + ahead[k])[None] + (down[k] * y)[:, None] for k in range(3)]
+    ways = np.moveaxis(rays @ (turn @ T_wc[:3, :3]).T.astype(np.float32), 2, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         if body.sphere:
             a = sum(way * way for way in ways)
@@ -145,11 +158,10 @@ def _hit(body: Body, T_wc, x, y) -> Float[np.ndarray, "h w"]:
     return np.where((near < far) & (far > _NEAR), t, np.float32(np.inf))
 
 
-def _shade(body: Body, T_wc, seen, focal: float) -> Float[np.ndarray, " n"]:
-    """Grey levels of the places that rays (x, y, 1) hit at depths t."""
-    x, y, t = seen
+def _shade(body: Body, T_wc, rays, t, focal: float) -> Float[np.ndarray, " n"]:
+    """Grey levels of the places that rays hit in t times their length."""
     paint, turn = body.paint, to_body(body)
-    way = np.stack([x, y, np.ones_like(x)]).T @ (turn @ T_wc[:3, :3]).T.astype(np.float32)
+    way = rays @ (turn @ T_wc[:3, :3]).T.astype(np.float32)
     place = (turn @ (T_wc[:3, 3] - np.asarray(body.centre))).astype(np.float32) + t[:, None] * way
     share = place / np.array(body.half, np.float32)
     face = np.argmax(np.abs(share), axis=1)
@@ -238,7 +250,16 @@ def _noise(rng: np.random.Generator, sigma: float) -> Float[np.ndarray, "h w"]:
 
 CALIBRATION = Calibration(480, 360, 394.0, 394.0, 239.5, 179.5, distortion=())
 """Of all: 63° across."""
-MODIFIERS = ("blur", "exposure")
+LENSES = {
+    "barrel": replace(CALIBRATION, distortion=(-0.08,)),
+    "mild": replace(CALIBRATION, distortion=(-0.04,)),
+    "pincushion": replace(CALIBRATION, distortion=(0.08,)),
+    "fisheye": Calibration(
+        512, 512, 163.0, 163.0, 255.5, 255.5, (0.0035, 0.0007, -0.002, 0.0002), model="fisheye"
+    ),
+}
+"""Of other lenses: phones', and a fisheye that sees 180° across and 250° from corner to corner."""
+MODIFIERS = ("blur", "exposure", *LENSES)
 """What may follow the kind of a video, each after a +."""
 SHUTTER = 0.5
 """The share of the time between frames over which a blurred one is exposed."""
@@ -286,7 +307,11 @@ def rendered_source(
             yield image
 
     truth = Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1])))
-    return Source(f"{name} (seed {seed})", CALIBRATION, times, images, truth)
+    return Source(f"{name} (seed {seed})", _lens(modifiers), times, images, truth)
+
+
+def _lens(modifiers: list[str]) -> Calibration:
+    return next((LENSES[word] for word in modifiers if word in LENSES), CALIBRATION)
 
 
 def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, index: int) -> Image:
@@ -299,7 +324,7 @@ def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, in
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
     poses = kind.poses(time + offsets, np.random.default_rng([seed, 1]))
-    grey = np.mean([render(bodies, T_wc, CALIBRATION, sky) for T_wc in poses], axis=0)
+    grey = np.mean([render(bodies, T_wc, _lens(modifiers), sky) for T_wc in poses], axis=0)
     if "exposure" in modifiers:
         grey = (0.8 + 0.25 * np.cos(2 * np.pi * time / 5.3)) * grey + 12 * np.sin(time)
     return add_noise(as_image(grey), np.random.default_rng([seed, 2, index]))
@@ -441,7 +466,7 @@ def _block(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
-_APART = 2.5
+_BETWEEN = 2.5
 """Metres between two houses of a row."""
 
 
@@ -451,8 +476,8 @@ def _row(rng: np.random.Generator) -> list[Body]:
     wall, front = _paint(rng, 60.0, 80.0), [_paint(rng, 120.0) for _ in range(5)]
     sizes, x = rng.uniform(0.12, 0.4, (5, 3)), rng.uniform(-1.1, 1.1, 5)
     z = rng.uniform(2.0, 3.2, 5)
-    for start in np.arange(-10 * _APART, 31 * _APART, _APART):
-        bodies.append(Body((start, -1.0, 4.5), (_APART / 2 - 0.1, 2.4, 0.8), wall))
+    for start in np.arange(-10 * _BETWEEN, 31 * _BETWEEN, _BETWEEN):
+        bodies.append(Body((start, -1.0, 4.5), (_BETWEEN / 2 - 0.1, 2.4, 0.8), wall))
         for half, aside, away, paint in zip(sizes, x, z, front, strict=True):
             bodies.append(Body((start + aside, _FLOOR - half[1], away), half, paint))
     return bodies

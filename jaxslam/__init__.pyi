@@ -50,6 +50,7 @@ from jaxslam.models.calibration import AbstractCalibration, Considered, Estimate
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.frame import AbstractFrame, Keyframe, Robocentric, Submaps, WorldCentric
+from jaxslam.models.lens import AbstractLens, Fisheye, Ideal, RadialTangential, Rational
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
 from jaxslam.models.scale import AbstractScale, Metre, ScaleGauge
@@ -79,6 +80,7 @@ __all__ = [
     "AbstractFilter",
     "AbstractFrame",
     "AbstractLandmark",
+    "AbstractLens",
     "AbstractMotion",
     "AbstractPlacement",
     "AbstractScale",
@@ -97,12 +99,14 @@ __all__ = [
     "Expected",
     "Features",
     "FirstEstimates",
+    "Fisheye",
     "FramedHomogeneous",
     "Frames",
     "FromPrior",
     "FromWindow",
     "Gate",
     "GivenPoints",
+    "Ideal",
     "ImagePlane",
     "Innovation",
     "Invariant",
@@ -122,8 +126,10 @@ __all__ = [
     "Pinhole",
     "Position",
     "PriorMap",
+    "RadialTangential",
     "RandomWalk",
     "RangeBearing",
+    "Rational",
     "Rays",
     "Ring",
     "Robocentric",

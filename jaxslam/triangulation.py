@@ -34,7 +34,7 @@ from jaxslam.geometry import PLANAR, Scalar
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.linalg import semidefinite_root
 from jaxslam.models.calibration import Estimated, Known, White
-from jaxslam.models.camera import Camera, bearing, project
+from jaxslam.models.camera import Camera, project, ray
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
@@ -222,7 +222,7 @@ def _intersect(_: str, given: tuple[TwoViews, Array], normal: Float[Array, " n"]
     """
     views, pixels = given
     errors, cameras = views.errors(normal)
-    first, second = jax.vmap(bearing)(cameras, (pixels + errors)[:, None])[:, 0]
+    first, second = jax.vmap(ray)(cameras, (pixels + errors)[:, None])[:, 0]
     inverse_depth = (first - second) / views.baseline
     prior = InverseDepth.beyond(views.nearest_depth)
     log_weight = -(((inverse_depth - prior.mean) / prior.sigma) ** 2) / 2

@@ -97,13 +97,18 @@ def landmarks_from_above(slam: AbstractFilter, state: Belief, slots: Slots) -> E
 def landmarks_on_sides(
     slam: AbstractFilter, state: Belief, slots: Slots
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The numbers of landmarks surely, by 2σ, in front of infinity, 1/z > 0, and surely behind.
+    """The numbers of landmarks surely, by 2σ, in front of infinity, 1/z > 0 (of a fisheye, one over
+    the distance), and surely behind.
 
     Pixels do not distinguish the two: a world that is mostly behind is a reversed one.
     """
-    inverse_depth, P = slam.landmark_marginal(
-        state, lambda view: (view.omega / view.point[-1])[None], slots
-    )
+
+    def last(view: LandmarkView):
+        if slam.model is None:
+            return (view.omega / view.point[-1])[None]
+        return slam.model.sensor.chart(view.point, view.omega)[-1:]
+
+    inverse_depth, P = slam.landmark_marginal(state, last, slots)
     sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > 4 * P[:, 0, 0])
     ahead = inverse_depth[:, 0] > 0
     return jnp.sum(sure & ahead), jnp.sum(sure & ~ahead)

@@ -1,4 +1,4 @@
-"""A camera's calibration: pinhole with OpenCV's distortion, and the JSON file that holds it."""
+"""A camera's calibration: intrinsics and lens, and the JSON file that holds it."""
 
 import math
 from collections.abc import Sequence
@@ -10,11 +10,18 @@ from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, write_json
 
-MODEL = "pinhole"
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _KEYS = ("width", "height", *INTRINSICS)
+MODELS = {
+    "pinhole": "k1 k2 p1 p2 k3",
+    "rational": "k1 k2 p1 p2 k3 k4 k5 k6",
+    "fisheye": "k1 k2 k3 k4",
+}
+"""The numbers of every model's lens, in order (`jaxslam.models.lens`)."""
 GUESSED_FIELD_OF_VIEW = 65.0
 """Degrees along the longer side: between a phone that films and a webcam."""
+LENS_SIGMA = (0.15, 0.05)
+"""σ of k1 and k2 of a lens that is guessed, or of which only the field of view is told: phones'."""
 _GUESSED_SHARE, _TOLD_SHARE, _CENTRE_SHARE = 0.15, 0.05, 0.02
 """σ of a focal length that is guessed, and of one that a field of view tells (cropped by who knows
 what), as shares of it; σ of the principal point as a share of the longer side."""
@@ -22,12 +29,13 @@ what), as shares of it; σ of the principal point as a share of the longer side.
 
 @dataclass(frozen=True)
 class Calibration:
-    """Pinhole intrinsics and OpenCV's distortion, for one image size.
+    """Intrinsics and lens of a camera, for one image size.
 
     `width`, `height`, `fx`, `fy`, `cx`, `cy` are in pixels, the centre of the first pixel is
-    (0, 0); `distortion` holds OpenCV's k1, k2, p1, p2, k3 (no unit), a shorter one is padded
-    with zeros. `sigma` are standard deviations of fx, fy, cx, cy, pixels; none where they
-    are unknown. A `guessed` one has square pixels, so that fx and fy are off by one number.
+    (0, 0); `distortion` holds the numbers (no unit) of the lens, which `MODELS` names by its
+    `model`: of a pinhole OpenCV's k1, k2, p1, p2, k3. A shorter one is padded with zeros. `sigma`
+    are standard deviations of fx, fy, cx, cy, pixels; none where they are unknown. A `guessed` one
+    has square pixels, so that fx and fy are off by one number.
     Raises `ValueError` for numbers that cannot be a camera's.
     """
 
@@ -40,6 +48,7 @@ class Calibration:
     distortion: tuple[float, ...] = ()
     sigma: tuple[float, ...] = ()
     guessed: bool = False
+    model: str = "pinhole"
 
     def __post_init__(self) -> None:
         for key in _KEYS:
@@ -54,7 +63,7 @@ class Calibration:
         for key in ("width", "height", "fx", "fy"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"{key} must be positive, not {getattr(self, key)}")
-        object.__setattr__(self, "distortion", _padded(self.distortion))
+        object.__setattr__(self, "distortion", _padded(self.model, self.distortion))
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
 
     @property
@@ -107,7 +116,7 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Jso
 
 def as_fields(calibration: Calibration) -> dict[str, Json]:
     """The fields of the file; those not stated are left out."""
-    fields = {"model": MODEL, **asdict(calibration)}
+    fields = {"model": calibration.model, **asdict(calibration)}
     fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))
     return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}
 
@@ -115,20 +124,20 @@ def as_fields(calibration: Calibration) -> dict[str, Json]:
 def from_fields(fields: object) -> Calibration:
     """The calibration of these fields, the inverse of `as_fields`.
 
-    Raises ValueError for what is no pinhole camera's.
+    Raises ValueError for what is no camera's.
     """
     if not isinstance(fields, dict):
         raise ValueError(f"expected a JSON object, not a {type(fields).__name__}")
-    if (model := fields.get("model", MODEL)) != MODEL:
-        raise ValueError(f"unknown camera model {model!r}; expected {MODEL!r}")
     if missing := [key for key in _KEYS if key not in fields]:
         raise ValueError(f"missing {', '.join(missing)}; {', '.join(_KEYS)} are needed")
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
-        raise ValueError("distortion must be a list of OpenCV's k1, k2, p1, p2, k3")
+        raise ValueError("distortion must be a list of the lens's numbers, k1 first")
     numbers, sigma = {key: fields[key] for key in _KEYS}, _sigma_from(fields.get("sigma", {}))
-    guessed = fields.get("guessed") is True
-    return Calibration(**numbers, distortion=tuple(distortion), sigma=sigma, guessed=guessed)
+    return Calibration(
+        **numbers, distortion=tuple(distortion), sigma=sigma,
+        guessed=fields.get("guessed") is True, model=str(fields.get("model", "pinhole")),
+    )  # fmt: skip
 
 
 def _sigma_from(sigma: object) -> tuple[float, ...]:
@@ -155,11 +164,14 @@ def _checked_sigma(sigma: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(value) for value in sigma)
 
 
-def _padded(distortion: Sequence[float]) -> tuple[float, ...]:
-    if len(distortion) > 5:
+def _padded(model: str, distortion: Sequence[float]) -> tuple[float, ...]:
+    if model not in MODELS:
+        raise ValueError(f"unknown camera model {model!r}; expected {', '.join(MODELS)}")
+    names = MODELS[model].split()
+    if len(distortion) > len(names):
         raise ValueError(
-            f"distortion has {len(distortion)} entries; expected at most k1, k2, p1, p2, k3"
+            f"distortion has {len(distortion)} entries; expected at most {', '.join(names)}"
         )
     for index, value in enumerate(distortion):
         _require_number(f"distortion[{index}]", value)
-    return tuple(float(value) for value in distortion) + (0.0,) * (5 - len(distortion))
+    return tuple(map(float, distortion)) + (0.0,) * (len(names) - len(distortion))

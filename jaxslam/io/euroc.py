@@ -1,6 +1,7 @@
 """EuRoC's layout (ASL): `mav0/cam0` with its `sensor.yaml`, and the body's true motion.
 
-Burri et al., IJRR 2016. The truth is of the body; the camera is at T_BS in it.
+Burri et al., IJRR 2016. The truth is of the body; the camera is at T_BS in it. TUM-VI's has no
+`sensor.yaml`; its lens is in `dso/camchain.yaml`.
 """
 
 import re
@@ -35,7 +36,8 @@ def _open(path: Path, _rate: float) -> Recording:
     times, names = read_timestamps(listing, NANOSECONDS, ",")
     files = listed(listing, camera / "data", names)
     yaml, truth = camera / "sensor.yaml", root / TRUTH / "data.csv"
-    calibration = fixed(read_calibration(yaml)) if yaml.is_file() else None
+    lenses = (x for x in (yaml, path / "dso" / "camchain.yaml") if x.is_file())  # or TUM-VI's
+    calibration = next((fixed(read_calibration(x)) for x in lenses), None)
     reference = _camera_truth(truth, yaml) if truth.is_file() and yaml.is_file() else None
     return of_files(path, files, times, calibration, reference)
 

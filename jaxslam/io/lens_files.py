@@ -11,9 +11,16 @@ import numpy as np
 from jaxslam.io.calibration import INTRINSICS, Calibration, from_fields
 from jaxslam.io.text import numbers, text_lines
 
-PINHOLES = ("pinhole", "PinHole", "")
-PLUMB_BOB = ("plumb_bob", "radtan", "radial-tangential", "opencv", "none", "")
-"""What programs call OpenCV's k1, k2, p1, p2, k3."""
+_MODELS = {
+    **dict.fromkeys(("pinhole", "plumb_bob", "radtan", "radial-tangential", "opencv", "none"), ""),
+    **dict.fromkeys(("rational_polynomial", "rational"), "rational"),
+    **dict.fromkeys(
+        ("equidistant", "equi", "fisheye", "kannala_brandt", "kannalabrandt8"), "fisheye"
+    ),
+}
+"""Our models by what programs call cameras and their distortion; "" of OpenCV's numbers, which are
+rational where they are more than five."""
+_NAMES = ("camera_model", "Camera.type", "distortion_model")
 _SIZE = (("width", "image_width", "Camera.width"), ("height", "image_height", "Camera.height"))
 _MATRIX = ("camera_matrix.data", "camera_matrix", "K.data", "K", "intrinsics", "Camera")
 _DISTORTION = (
@@ -26,6 +33,10 @@ _COLMAP: dict[str, Callable[..., tuple[float, ...]]] = {
     "SIMPLE_RADIAL": lambda f, x, y, k: (f, f, x, y, k),
     "RADIAL": lambda f, x, y, k1, k2: (f, f, x, y, k1, k2),
     "OPENCV": lambda *eight: eight,
+    "FULL_OPENCV": lambda *twelve: twelve,
+    "SIMPLE_RADIAL_FISHEYE": lambda f, x, y, k: (f, f, x, y, k),
+    "RADIAL_FISHEYE": lambda f, x, y, k1, k2: (f, f, x, y, k1, k2),
+    "OPENCV_FISHEYE": lambda *eight: eight,
 }
 """fx, fy, cx, cy and the distortion by the parameters of COLMAP's models."""
 ACCEPTED = (
@@ -37,8 +48,8 @@ ACCEPTED = (
 def read_calibration(path: str | Path) -> Calibration:
     """The calibration in a JSON file as `write_calibration` writes it, or of another program.
 
-    Raises `ValueError`, naming the file, where it is missing, or holds no pinhole camera with
-    OpenCV's distortion.
+    Raises `ValueError`, naming the file, where it is missing, or holds no lens of
+    `jaxslam.models.lens`.
     """
     lines = list(text_lines(path, "calibration").values())
     try:
@@ -55,40 +66,45 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def of_keys(fields: dict[str, object]) -> Calibration:
-    """The calibration of the keys that programs use. Raises ValueError for what is no pinhole."""
-    model = str(fields.get("camera_model", fields.get("Camera.type", "")))
-    if model not in PINHOLES:
-        raise ValueError(f"unknown camera_model {model!r}; expected 'pinhole'")
+    """The calibration of the keys that programs use. Raises ValueError for what is none."""
     size = _values(fields.get("resolution"))
     if len(size) != 2:
         size = [x for names in _SIZE for x in _first(fields, names)]
-    lens = _first(fields, _MATRIX) or _values([fields.get(f"Camera.{x}") for x in INTRINSICS])
-    lens = [lens[i] for i in (0, 4, 2, 5)] if len(lens) == 9 else lens
-    if len(size) != 2 or len(lens) != 4:
-        told = ", ".join(list(fields)[:12]) or "none"
-        raise ValueError(f"has no image size or no camera matrix; its keys are {told}")
+    matrix = _first(fields, _MATRIX) or _values([fields.get(f"Camera.{x}") for x in INTRINSICS])
+    matrix = [matrix[i] for i in (0, 4, 2, 5)] if len(matrix) == 9 else matrix
+    names = [str(fields[key]) for key in _NAMES if fields.get(key)]
+    names += ["fisheye"] if _values(fields.get("fisheye_model")) == [1.0] else []  # OpenCV's flag
     distortion = _first(fields, _DISTORTION)
     if not distortion and "Camera.k1" in fields:
-        names = ("k1", "k2", "p1", "p2", "k3")
-        distortion = _values([fields.get(f"Camera.{x}", 0) for x in names])
-    distortion = plumb_bob(str(fields.get("distortion_model", "")), distortion)
-    return Calibration(int(size[0]), int(size[1]), *lens, distortion=distortion)
+        order = "k1 k2 k3 k4" if "Camera.k4" in fields else "k1 k2 p1 p2 k3"
+        distortion = _values([fields.get(f"Camera.{x}", 0) for x in order.split()])
+    model, distortion = lens(names, distortion)
+    if len(size) != 2 or len(matrix) != 4:
+        told = ", ".join(list(fields)[:12]) or "none"
+        raise ValueError(f"has no image size or no camera matrix; its keys are {told}")
+    return Calibration(int(size[0]), int(size[1]), *matrix, distortion=distortion, model=model)
 
 
-def plumb_bob(model: str, distortion: Sequence[float]) -> tuple[float, ...]:
-    """OpenCV's k1, k2, p1, p2, k3 of a distortion. Raises ValueError for one that has more.
-
-    A rational polynomial whose other numbers are zero is this one too.
-    """
-    others = [float(x) for x in distortion[5:]]
-    known = (*PLUMB_BOB, "rational_polynomial") if not any(others) else PLUMB_BOB
-    if model not in known or any(others):
+def lens(names: Sequence[str], distortion: Sequence[float]) -> tuple[str, tuple[float, ...]]:
+    """Our model and its numbers of a distortion, by all `names` that a program gives it (Kalibr's
+    `pinhole-equi` is two). Raises ValueError for one that is none of ours."""
+    words = [
+        word for name in map(str.lower, names)
+        for word in ([name] if name in _MODELS else name.split("-"))
+    ]  # fmt: skip
+    model = next(filter(None, map(_MODELS.get, words)), "")
+    told = [float(x) for x in distortion]
+    most = 4 if model == "fisheye" else 8
+    if not set(words) <= _MODELS.keys() or any(told[most:]):
+        which = " ".join(names) or "no name"
         raise ValueError(
-            f"unknown distortion_model {model!r} of {len(distortion)} numbers; expected plumb_bob "
-            "(radtan), k1, k2, p1, p2, k3; undistort the pictures, or calibrate anew "
-            "(jaxslam calibrate)"
+            f"unknown lens, {which} of {len(told)} numbers; expected plumb_bob (radtan), "
+            "rational_polynomial or equidistant (fisheye); undistort the pictures, or calibrate "
+            "anew (jaxslam calibrate)"
         )
-    return tuple(float(x) for x in distortion[:5])
+    if model != "fisheye":  # a rational polynomial of zeros is a pinhole's
+        model = "rational" if any(told[5:]) else "pinhole"
+    return model, tuple(told[: 5 if model == "pinhole" else most])
 
 
 def _of_colmap(lines: Sequence[str]) -> Calibration:
@@ -103,7 +119,8 @@ def _of_colmap(lines: Sequence[str]) -> Calibration:
             f"unknown camera model {name} of {len(told)} numbers; known: {known}"
         ) from None
     size = int(values[0]), int(values[1])
-    return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=tuple(distortion))
+    model, distortion = lens(["fisheye"] if name.endswith("FISHEYE") else [], distortion)
+    return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=distortion, model=model)
 
 
 def _of_yaml(text: str) -> dict[str, object]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.io.lens_files import plumb_bob
+from jaxslam.io.lens_files import lens as lens_of
 from jaxslam.io.recording import Calibrator, Layout, Recording, check_increasing, decoded
 from jaxslam.io.ros import BAG, Message, Topic, bag_and_topic, chosen, messages, seconds
 from jaxslam.io.source import Image
@@ -82,8 +82,11 @@ def _calibrator(topic: Topic) -> Calibrator | None:
         matrix = (P if rectified else K).reshape(3, -1)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         binned = [max(int(getattr(info, f"binning_{axis}")), 1) for axis in "xy"]
         try:
-            distortion = () if rectified else plumb_bob(info.distortion_model, D.tolist())
-            whole = Calibration(info.width, info.height, *matrix, distortion=distortion)
+            names = [info.distortion_model] if info.distortion_model else []
+            model, distortion = lens_of(*(([], []) if rectified else (names, D.tolist())))
+            whole = Calibration(
+                info.width, info.height, *matrix, distortion=distortion, model=model
+            )
             return whole.resized(info.width // binned[0], info.height // binned[1])
         except ValueError as error:
             raise ValueError(f"{beside}: {error}") from None

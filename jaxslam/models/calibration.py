@@ -64,7 +64,8 @@ class White(AbstractCalibration):
     each_frame: ClassVar[bool] = True
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (D of P15)."""
+    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (D of P15), and of the lens's k1 and k2
+    unless those are known."""
 
 
 class Considered(AbstractCalibration):
@@ -74,7 +75,7 @@ class Considered(AbstractCalibration):
     corrected: ClassVar[bool] = False
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """As `White.sigma`."""
 
 
 class Estimated(AbstractCalibration):
@@ -83,7 +84,7 @@ class Estimated(AbstractCalibration):
     name: ClassVar[str] = "estimated"
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """As `White.sigma`."""
 
 
 def check_calibration(treatment: AbstractCalibration, sensor: AbstractSensor) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
 from jaxslam.geometry import Homogeneous, Point
-from jaxslam.models.camera import Camera, bearing, project
+from jaxslam.models.camera import Camera, project, ray
 
 Measurement = Float[Array, " p"]
 
@@ -124,7 +124,10 @@ class AbstractSensor(eqx.Module):
 
 
 class Pinhole(AbstractSensor):
-    """A pixel (P14), on the homogeneous numerator; it hides 1/z. Chart (x/z, y/z, 1/z)."""
+    """A pixel (P14), on the homogeneous numerator; it hides one over the lens's depth.
+
+    That is z, and the chart (x/z, y/z, 1/z) for an ideal lens; of a fisheye, the distance.
+    """
 
     hidden: ClassVar[int] = 1
 
@@ -149,16 +152,17 @@ class Pinhole(AbstractSensor):
         return project(self.camera, point)
 
     def locate(self, measured: Measurement, hidden: Float[Array, " 1"]) -> Homogeneous:
-        return jnp.append(bearing(self.camera, measured), 1.0), hidden[0]
+        return ray(self.camera, measured), hidden[0]
 
     def possible(self, point: Point) -> Bool[Array, ""]:
-        return point[-1] > 0
+        return self.camera.lens.sees(point)
 
     def visible(self, point: Point, measured: Measurement, view: FieldOfView) -> Bool[Array, ""]:
-        """In front of the camera and inside the picture."""
+        """Seen by the lens, inside the picture, and not too near."""
         image = 2 * self.camera.centre if view.image is None else view.image
         inside = jnp.all((measured >= 0) & (measured < image))
-        return inside & (point[-1] > view.visible_depth)
+        far = self.camera.lens.depth(point) > view.visible_depth
+        return inside & far & self.possible(point)
 
     @property
     def view(self) -> FieldOfView:
@@ -166,14 +170,16 @@ class Pinhole(AbstractSensor):
         return FieldOfView(image=2 * self.camera.centre)
 
     def chart(self, point: Point, omega: Number) -> Point:
-        return jnp.append(point[:-1], omega) / point[-1]
+        """Where the lens shows it, at unit focal length, and its inverse depth."""
+        lens = self.camera.lens
+        return jnp.append(lens.distort(point), omega / lens.depth(point))
 
     @property
     def focal(self) -> Float[AnyArray, ""]:
         return self.camera.focal[..., 0]
 
     def perturbed(self, delta: Float[Array, " k"]) -> "Pinhole":
-        """Intrinsics moved by δ, of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (P15)."""
+        """Intrinsics moved by δ, as `Camera.perturbed` has it (P15)."""
         return replace(self, camera=self.camera.perturbed(delta))
 
 

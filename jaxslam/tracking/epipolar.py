@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.optics import on_pinhole
 
 MINIMAL = 5
 """Matches through which there always is an essential matrix."""
@@ -18,15 +19,18 @@ def of_one_motion(
     sigma: float,
 ) -> Bool[np.ndarray, " m"]:
     """Return those near the epipolar lines of the essential matrix with the most of them near, by
-    MAGSAC++ (Barath et al., CVPR 2020) in OpenCV; `sigma` is a pixel's. None of fewer than six.
+    MAGSAC++ (Barath et al., CVPR 2020) in OpenCV; `sigma` is a pixel's. None of fewer than six,
+    and none far from the axis of a fisheye.
 
     Neither a prior on depth nor one on the motion is needed, and no linear prediction.
     """
-    if len(before) <= MINIMAL:
+    (first, inside), (second, within) = (on_pinhole(calibration, x) for x in (before, now))
+    near = inside & within
+    if near.sum() <= MINIMAL:
         return np.zeros(len(before), bool)
-    K, distortion = calibration.matrix, np.array(calibration.distortion, float)
-    pixels = [cv2.undistortPoints(x[:, None], K, distortion, P=K)[:, 0] for x in (before, now)]
-    E, inside = cv2.findEssentialMat(
-        *pixels, K, method=cv2.USAC_MAGSAC, prob=CONFIDENCE, threshold=3 * sigma
-    )
-    return np.zeros(len(before), bool) if E is None else inside[:, 0].astype(bool)
+    E, agree = cv2.findEssentialMat(
+        first[near], second[near], calibration.matrix, method=cv2.USAC_MAGSAC, prob=CONFIDENCE,
+        threshold=3 * sigma,
+    )  # fmt: skip
+    near[near] = False if E is None else agree[:, 0].astype(bool)
+    return near

@@ -248,8 +248,8 @@ class Estimator:
         return jax.device_get(_world_points(self.slam, state, self.settings.capacity))
 
     def camera(self, state: Belief) -> tuple[str, np.ndarray, np.ndarray] | None:
-        """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels.
-        None of a filter without a pinhole camera."""
+        """Return how the calibration is treated, and fx, fy, cx, cy in pixels, and k1 and k2 of a
+        lens that has them, with their covariance. None of a filter without a pinhole camera."""
         model = self.slam.model
         if model is None or not isinstance(model.sensor, Pinhole):
             return None

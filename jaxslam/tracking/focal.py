@@ -1,147 +1,189 @@
-"""Whether matches fit the focal length that was given: bundles adjusted with it and with others."""
+"""Whether matches fit the lens that was given: bundles adjusted with it, and with it free."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from jaxslam._runtime.files import Json
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.report import Tracked
 
-FACTOR = 1.2
-"""Focal lengths so many times as long, and as short, are tried."""
 CLEAR = 0.8
-"""The share of the squares that is left where one of them fits clearly better."""
+"""The share of the squares that is left where another lens fits clearly better."""
 _STRETCHES, _SPAN, _VIEWS = 3, 100, 10  # of the video, in frames, and of each stretch
-_STEPS, _LOOSE = 12, 1.5  # of Levenberg and Marquardt; Cauchy's loss, pixels
+_STEPS, _LOOSE = 25, 1.5  # of Levenberg and Marquardt; Cauchy's loss, pixels
+_PRIOR = 0.3
+"""σ of the logarithm of the focal length and of k1 where nothing tells them, with that of a pixel
+for a unit."""
 
-_Views = list[tuple[np.ndarray, np.ndarray]]
-"""Of each, which points it sees, and at which pixels."""
+
+class BetterLens(NamedTuple):
+    """The lens that fits best, and how much better than the one that was given."""
+
+    focal: float
+    """Its focal lengths, as a factor."""
+    k1: float
+    """By how much its k1 is greater."""
+    sigma: Float[np.ndarray, " 2"]
+    """σ of the factor's logarithm and of k1, of independent errors."""
+    left: float
+    """The share of the squared residuals that is left; 1 where too few points are shared."""
+
+    def as_summary(self, given: Calibration) -> dict[str, Json]:
+        """Return an entry of summary.json; whether it is the distortion, more than the focal
+        length, that was wrong at half the picture's diagonal."""
+        r2 = (given.width / given.fx) ** 2 + (given.height / given.fy) ** 2
+        return {
+            "fx": given.fx * self.focal,
+            "k1": given.distortion[0] + self.k1,
+            "sigma": {"fx": given.fx * float(self.sigma[0]), "k1": float(self.sigma[1])},
+            "squares_left": self.left,
+            "distortion": abs(self.k1) * r2 / 4 > abs(self.focal - 1),
+        }
 
 
-def better_focal(
-    history: Sequence[Tracked], points: Points, calibration: Calibration
-) -> tuple[float, float]:
-    """Return the factor, `FACTOR` or its inverse, with which focal lengths fit better, and the
-    share of the squared residuals that is left then; 1 where too few points are shared to tell.
-
-    Views of three stretches of the video are adjusted with the points that they share, from where
-    the tracker has both. On real videos .89 of the squares are left at least where the focal length
-    is right, and at most .75 where it is 20 % off and the path tells (docs/own-video.md).
-    """
-    left = np.zeros(3)
+def better_lens(history: Sequence[Tracked], points: Points, calibration: Calibration) -> BetterLens:
+    """Adjust views of three stretches of the video with the points that they share, from where the
+    tracker has both, with the lens that was given and with focal length and k1 free."""
+    squares, information, weighed = np.zeros(2), np.eye(2) / _PRIOR**2, np.zeros(2)
     for first in np.unique(np.linspace(0, max(len(history) - _SPAN, 0), _STRETCHES).astype(int)):
         last = min(first + _SPAN, len(history)) - 1
         chosen = [history[i] for i in np.unique(np.linspace(first, last, _VIEWS).astype(int))]
         seen = [one for one in chosen if not one.lost and one.map == chosen[-1].map]
-        views, places = _shared(seen, points)
+        bundle = _Bundle.of(seen, points, calibration)
+        if 2 * len(bundle.view) > 1.2 * (6 * len(bundle.shifts) + bundle.places.size):
+            told, free = (bundle.adjusted(freed=freed) for freed in (0.0, 1.0))
+            squares += told.left, free.left
+            information, weighed = information + free.known, weighed + free.known @ free.bundle.lens
+    if not squares[0]:
+        return BetterLens(1.0, 0.0, np.full(2, np.inf), 1.0)
+    covariance = np.linalg.inv(information)
+    logarithm, k1 = covariance @ weighed
+    sigma = np.sqrt(np.diagonal(covariance))
+    return BetterLens(float(np.exp(logarithm)), float(k1), sigma, float(squares[1] / squares[0]))
+
+
+class _Bundle(NamedTuple):
+    """v views of p places by n pixels: `T_cw` of each view by turns and shifts, and the logarithm
+    of the factor of the focal lengths and what is added to k1."""
+
+    turns: Float[np.ndarray, "v 3 3"]
+    shifts: Float[np.ndarray, "v 3"]
+    places: Float[np.ndarray, "p 3"]
+    lens: Float[np.ndarray, " 2"]
+    view: Int[np.ndarray, " n"]
+    place: Int[np.ndarray, " n"]
+    pixels: Float[np.ndarray, "n 2"]
+    given: Calibration
+
+    @classmethod
+    def of(cls, seen: Sequence[Tracked], points: Points, calibration: Calibration) -> _Bundle:
+        """The points that three views share and all have before them, from the first view."""
+        sights = [one.sights for one in seen]
+        count = sum((np.isin(points.numbers, list(those)) for those in sights), 0 * points.numbers)
+        with np.errstate(invalid="ignore"):  # of points that are nowhere
+            ahead = [(points.points - one.T_wc[:3, 3]) @ one.T_wc[:3, 2] > 0 for one in seen]
+        kept = (count >= 3) & np.all(ahead, axis=0) & np.isfinite(points.points).all(axis=1)
+        index = {number: i for i, number in enumerate(points.numbers[kept].tolist())}
+        found = [
+            [(index[n], *pixel) for n, pixel in those.items() if n in index] for those in sights
+        ]
         # A camera that turned away shares nothing with the others.
-        sharing = [i for i, (which, _) in enumerate(views) if len(which)]
-        seen, views = [seen[i] for i in sharing], [views[i] for i in sharing]
-        if 2 * sum(len(which) for which, _ in views) > 1.2 * (6 * len(views) + places.size):
-            T_wc = np.array([one.T_wc for one in seen])
-            factors = (1 / FACTOR, 1.0, FACTOR)
-            left += [_left(T_wc, views, places, calibration, factor) for factor in factors]
-    best = 0 if left[0] < left[2] else 2
-    return (1 / FACTOR, 1.0, FACTOR)[best], float(left[best] / left[1]) if left[1] else 1.0
+        sharing = [i for i, rows in enumerate(found) if rows]
+        table = np.array([(v, *row) for v, i in enumerate(sharing) for row in found[i]])
+        table = table.reshape(-1, 4)
+        view, place = table[:, :2].astype(int).T
+        T_wc = np.array([seen[i].T_wc for i in sharing]).reshape(-1, 4, 4)
+        T_wf = T_wc[0] if sharing else np.eye(4)
+        places = (points.points[kept] - T_wf[:3, 3]) @ T_wf[:3, :3]
+        T_cf = np.linalg.inv(T_wc) @ T_wf
+        lens = np.zeros(2)
+        return cls(
+            T_cf[:, :3, :3], T_cf[:, :3, 3], places, lens, view, place, table[:, 2:], calibration
+        )
 
+    def camera(self, k1: float = 0.0) -> Calibration:
+        """The lens, with so much more k1."""
+        c, times = self.given, float(np.exp(self.lens[0]))
+        more = float(self.lens[1]) + k1
+        distortion = (c.distortion[0] + more, *c.distortion[1:])
+        return replace(c, fx=c.fx * times, fy=c.fy * times, distortion=distortion)
 
-def _shared(seen: Sequence[Tracked], points: Points) -> tuple[_Views, Float[np.ndarray, "p 3"]]:
-    """The points that three views share and all have before them, and where those are."""
-    sights = [one.sights for one in seen]
-    count = sum((np.isin(points.numbers, list(those)) for those in sights), 0 * points.numbers)
-    with np.errstate(invalid="ignore"):  # of points that are nowhere
-        ahead = [(points.points - one.T_wc[:3, 3]) @ one.T_wc[:3, 2] > 0 for one in seen]
-    kept = (count >= 3) & np.all(ahead, axis=0) & np.isfinite(points.points).all(axis=1)
-    index = {number: i for i, number in enumerate(points.numbers[kept].tolist())}
-    found = [[(index[n], *pixel) for n, pixel in those.items() if n in index] for those in sights]
-    tables = [np.array(rows, float).reshape(-1, 3) for rows in found]
-    return [(table[:, 0].astype(int), table[:, 1:]) for table in tables], points.points[kept]
+    def less(self, step: Float[np.ndarray, " c"]) -> _Bundle:
+        """The bundle without a step, of turn and shift of every view, of the lens and of places."""
+        of_views, of_lens, of_places = np.split(
+            step, [self.shifts.size * 2, self.shifts.size * 2 + 2]
+        )
+        turns, shifts = np.split(of_views.reshape(-1, 6), 2, axis=1)
+        nudges = np.array([cv2.Rodrigues(-turn)[0] for turn in turns])
+        return self._replace(
+            turns=nudges @ self.turns, shifts=self.shifts - shifts, lens=self.lens - of_lens,
+            places=self.places - of_places.reshape(-1, 3),
+        )  # fmt: skip
 
-
-def _left(
-    T_wc: Float[np.ndarray, "v 4 4"],
-    views: _Views,
-    places: Float[np.ndarray, "p 3"],
-    calibration: Calibration,
-    factor: float,
-) -> float:
-    """Return the sum of squares that Levenberg and Marquardt reach, with focal lengths `factor`
-    times as long."""
-    K = calibration.matrix.copy()
-    K[[0, 1], [0, 1]] *= factor
-    # What is so much deeper, and turns so much less, looks nearly the same.
-    to_first, longer = np.linalg.inv(T_wc[0]), np.array([1.0, 1.0, factor])
-    poses = np.zeros((len(views), 6))
-    for pose, T in zip(poses, to_first @ T_wc, strict=True):
-        pose[:3] = cv2.Rodrigues(T[:3, :3].T)[0][:, 0] / [factor, factor, 1.0]
-        pose[3:] = -cv2.Rodrigues(pose[:3])[0] @ (T[:3, 3] * longer)
-    places = (places @ to_first[:3, :3].T + to_first[:3, 3]) * longer
-    now, damping = _Linear.at(poses, places, views, K, calibration), 1e-3
-    for _ in range(_STEPS):
-        step = now.step(damping)
-        tried = _Linear.at(poses - step[0], places - step[1], views, K, calibration)
-        if tried.left < now.left:
-            poses, places, now, damping = poses - step[0], places - step[1], tried, damping / 10
-        else:
-            damping *= 10
-    return now.left
+    def adjusted(self, *, freed: float) -> _Linear:
+        """What Levenberg and Marquardt reach, with the lens `freed` (1) or as it is (0)."""
+        now, damping = _Linear.at(self, freed), 1e-3
+        for _ in range(_STEPS):
+            H = now.by.T @ now.by
+            H += np.diag(damping * np.diagonal(H) + 1e-9)
+            tried = _Linear.at(now.bundle.less(np.linalg.solve(H, now.by.T @ now.off)), freed)
+            done = 0 <= now.left - tried.left < 1e-3 * now.left
+            now, damping = (tried, damping / 10) if tried.left < now.left else (now, 10 * damping)
+            if done:
+                break
+        return now
 
 
 class _Linear(NamedTuple):
-    """The sum of squares by Cauchy's loss, half its gradient and its Hessian after Gauss, by poses
-    (rotation vectors and positions of the world in v views) and by p places."""
+    """The sum of squares by Cauchy's loss at a bundle, and what is squared and its Jacobian, by
+    views, lens and places, as that loss weighs them."""
 
+    bundle: _Bundle
     left: float
-    by_poses: Float[np.ndarray, "v 6"]
-    by_places: Float[np.ndarray, "p 3"]
-    of_poses: Float[np.ndarray, "v 6 6"]
-    of_places: Float[np.ndarray, "p 3 3"]
-    of_both: Float[np.ndarray, "v p 6 3"]
+    off: Float[np.ndarray, " r"]
+    by: Float[np.ndarray, "r c"]
 
     @classmethod
-    def at(
-        cls,
-        poses: Float[np.ndarray, "v 6"],
-        places: Float[np.ndarray, "p 3"],
-        views: _Views,
-        K: Float[np.ndarray, "3 3"],
-        calibration: Calibration,
-    ) -> _Linear:
-        v, p = len(poses), len(places)
-        shapes = (v, 6), (p, 3), (v, 6, 6), (p, 3, 3), (v, p, 6, 3)
-        distortion = np.array(calibration.distortion)
-        left, parts = 0.0, tuple(np.zeros(shape) for shape in shapes)
-        for i, (pose, (which, pixels)) in enumerate(zip(poses, views, strict=True)):
-            seen, by = cv2.projectPoints(places[which], pose[:3], pose[3:], K, distortion)
-            off = seen[:, 0] - pixels
-            far = np.sum(off**2, axis=1) / _LOOSE**2
-            left += _LOOSE**2 * float(np.log1p(far).sum())
-            A = by[:, :6].reshape(-1, 2, 6)
-            B = (by[:, 3:6] @ cv2.Rodrigues(pose[:3])[0]).reshape(-1, 2, 3)
-            WA, WB = (np.swapaxes(X, 1, 2) / (1 + far)[:, None, None] for X in (A, B))
-            parts[0][i] = (WA @ off[:, :, None]).sum(axis=0)[:, 0]
-            parts[1][which] += (WB @ off[:, :, None])[:, :, 0]
-            parts[2][i] = (WA @ A).sum(axis=0)
-            parts[3][which] += WB @ B
-            parts[4][i, which] = WA @ B
-        return cls(left, *parts)
+    def at(cls, bundle: _Bundle, freed: float) -> _Linear:
+        v, p, n = len(bundle.shifts), len(bundle.places), len(bundle.view)
+        R, h = bundle.turns[bundle.view], 1e-4
+        turned = np.einsum("nij,nj->ni", R, bundle.places[bundle.place])
+        X = turned + bundle.shifts[bundle.view]
+        seen, slopes, _ = sighted(bundle.camera(), X)
+        more, fewer = (sighted(bundle.camera(k1), X).pixels for k1 in (h, -h))
+        off, slopes = seen - bundle.pixels, slopes[:, :2]
+        far = np.sum(off**2, axis=1, keepdims=True) / _LOOSE**2
+        by = np.zeros((n, 2, 6 * v + 2 + 3 * p))
+        by_view = np.concatenate([np.cross(turned[:, None], slopes), slopes], axis=2)
+        centre = bundle.given.cx, bundle.given.cy
+        by_lens = freed * np.stack([seen - centre, (more - fewer) / (2 * h)], axis=2)
+        for first, block in (
+            (6 * bundle.view, by_view),
+            (np.full(n, 6 * v), by_lens),
+            (6 * v + 2 + 3 * bundle.place, slopes @ R),
+        ):
+            columns = first[:, None] + np.arange(block.shape[2])
+            by[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = block
+        prior = np.eye(2, by.shape[2], 6 * v) / _PRIOR
+        weights = 1 / np.sqrt(1 + far)
+        off = np.append(weights * off, bundle.lens / _PRIOR)
+        by = np.concatenate([(weights[..., None] * by).reshape(2 * n, -1), prior])
+        left = _LOOSE**2 * np.log1p(far).sum() + np.sum((bundle.lens / _PRIOR) ** 2)
+        return cls(bundle, float(left), off, by)
 
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """What Levenberg and Marquardt subtract, the places by Schur's complement."""
-        of_poses, of_places = (
-            H + np.eye(H.shape[-1]) * (damping * H + 1e-9) for H in (self.of_poses, self.of_places)
-        )
-        both, each = self.of_both, np.linalg.inv(of_places)
-        gain, v = both @ each, len(both)
-        left = -np.einsum("vpik,wpjk->viwj", gain, both)
-        left[np.arange(v), :, np.arange(v)] += of_poses
-        right = self.by_poses - np.einsum("vpik,pk->vi", gain, self.by_places)
-        of_pose = np.linalg.solve(left.reshape(6 * v, -1), right.ravel()).reshape(v, 6)
-        rest = self.by_places - np.einsum("vpij,vi->pj", both, of_pose)
-        return of_pose, np.einsum("pij,pj->pi", each, rest)
+    @property
+    def known(self) -> Float[np.ndarray, "2 2"]:
+        """What the matches tell of the lens: the inverse of its covariance."""
+        H, place = self.by.T @ self.by, 2 * self.bundle.shifts.size
+        covariance = np.linalg.inv(H + np.diag(1e-6 * np.diagonal(H) + 1e-9))
+        variance = self.left / max(len(self.by) - len(H), 1)
+        return np.linalg.inv(variance * covariance[place : place + 2, place : place + 2])

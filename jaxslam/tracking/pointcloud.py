@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import write_text
 from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.patches import Places
 from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 
@@ -93,21 +93,14 @@ def seen_from(
     """Pixels (u, v) of landmarks in the world frame, and their covariances to first order, px².
 
     u = π(R_cw X + t), P_u = J P_X Jᵀ with J = ∂π/∂t R_cw: the camera is taken to be where T_wc
-    says, and the spread is the landmark's alone. Not a number for what is behind the camera or
+    says, and the spread is the landmark's alone. Not a number for what the lens does not see or is
     out of the picture.
     """
-    T_cw = np.linalg.inv(T_wc)
-    behind = points @ T_cw[2, :3] + T_cw[2, 3] <= 0
-    if behind.all():
-        return np.full((len(points), 2), np.nan), np.full((len(points), 2, 2), np.nan)
-    turned, moved = cv2.Rodrigues(T_cw[:3, :3])[0], T_cw[:3, 3]
-    lens = np.array(calibration.distortion)
-    flat = np.ascontiguousarray(points)
-    pixels, jacobian = cv2.projectPoints(flat, turned, moved, calibration.matrix, lens)
-    pixels = pixels[:, 0]
-    J = jacobian[:, 3:6].reshape(-1, 2, 3) @ T_cw[:3, :3]
+    R_wc = T_wc[:3, :3]
+    pixels, slopes, seen = sighted(calibration, (points - T_wc[:3, 3]) @ R_wc)
+    J = slopes[:, :2] @ R_wc.T
     size = np.array([calibration.width, calibration.height])
-    inside = np.all((pixels >= 0) & (pixels <= size - 1), axis=1) & ~behind
+    inside = np.all((pixels >= 0) & (pixels <= size - 1), axis=1) & seen
     return (
         np.where(inside[:, None], pixels, np.nan),
         np.where(inside[:, None, None], J @ covariances @ np.swapaxes(J, 1, 2), np.nan),

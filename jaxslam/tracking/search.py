@@ -12,6 +12,7 @@ from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import in_view
 from jaxslam.tracking.matching import Matches, match_patches
 from jaxslam.tracking.observations import Observations, Prediction, Slots
+from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.patches import WINDOW, Picture
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -81,20 +82,16 @@ def changes_of_view(
     """Return how the picture around each landmark changed since its first view; zero where it
     cannot be determined.
 
-    The surface is taken to face the first camera; distortion is neglected, being nearly the
-    same over a patch.
+    The surface is taken to face the first camera: to have one depth there.
     """
     first = np.array([landmarks[slot].first_camera for slot in slots]).reshape(-1, 4, 4)
     T_first_now = np.linalg.inv(first) @ prediction.T_wc
     X, omega = prediction.points[slots], prediction.omegas[slots]
     start = np.einsum("kij,kj->ki", T_first_now[:, :3, :3], X)
     start += omega[:, None] * T_first_now[:, :3, 3]
-    ahead = np.where(np.abs(start[:, 2:]) < 1e-9, 1e-9, start[:, 2:])
-    # One pixel to the right and down in the first view, on the plane through the point.
-    step = ahead[:, :, None] * np.eye(3)[None, :2] / [[[calibration.fx]]]
-    moved = X[:, None] + np.einsum("kji,kaj->kai", T_first_now[:, :3, :3], step)
-    pixel = X[:, :2] / X[:, 2:]
-    focal = np.array([calibration.fx, calibration.fy])
-    affine = (moved[..., :2] / moved[..., 2:] - pixel[:, None]) * focal
-    affine = np.swapaxes(affine, 1, 2)
-    return np.where(np.isfinite(affine).all(axis=(1, 2), keepdims=True), affine, 0.0)
+    then, now = (sighted(calibration, points) for points in (start, X))
+    known = then.seen & np.isfinite(start).all(axis=1)
+    # One pixel to the right and down in the first view, in the axes of that camera.
+    step = np.linalg.inv(np.where(known[:, None, None], then.slopes, np.eye(3)))[..., :2]
+    affine = now.slopes[:, :2] @ np.swapaxes(T_first_now[:, :3, :3], 1, 2) @ step
+    return np.where(known[:, None, None], affine, 0.0)

@@ -11,13 +11,13 @@ from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.words import FILTERS, make_filter
-from jaxslam.io.calibration import Calibration
+from jaxslam.io.calibration import LENS_SIGMA, Calibration
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
-from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
+from jaxslam.tracking.optics import camera_of
 
 FIT = 36.0
 """The variance of a match by what it would be if its window's residual were white: distances from
@@ -121,15 +121,12 @@ class TrackerSettings:
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""
-        distortion = calibration.distortion if any(calibration.distortion) else None
-        focal, centre = (calibration.fx, calibration.fy), (calibration.cx, calibration.cy)
-        camera = Camera(focal, centre, distortion)
         accelerations = [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3
         velocities = [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3
         return make_filter(
             self.filter,
             motion=ConstantVelocity(accelerations, [0.0] * 6, velocities),
-            sensor=Pinhole(camera, self.pixel_sigma),
+            sensor=Pinhole(camera_of(calibration), self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),
             depth=self.depth,
@@ -140,4 +137,4 @@ class TrackerSettings:
         these."""
         name = self.calibration or ("estimated" if calibration.guessed else "known")
         sigma = list(calibration.sigma) or ([self.focal_sigma] * 2 + [self.centre_sigma] * 2)
-        return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)
+        return TREATMENTS[name]([*sigma[1:], *LENS_SIGMA] if calibration.guessed else sigma)

@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from jaxslam._runtime.files import Json
 from jaxslam._version import __version__
-from jaxslam.io.calibration import INTRINSICS, as_fields
+from jaxslam.io.calibration import INTRINSICS, MODELS, as_fields
 from jaxslam.io.source import Source, Trajectory
-from jaxslam.tracking.focal import CLEAR, better_focal
+from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -61,6 +61,7 @@ def summarised(
         "filter": tracker.filter_name,
         "settings": asdict(tracker.settings),
         "calibration": _calibration(tracker, history, points),
+        "lens": _lens(tracker),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -142,17 +143,15 @@ def describe(summary: Summary) -> str:
         )
     lines += [_unit_line(unit) for unit in summary["units"] if unit["sigma_log_scale"] is not None]
     camera = summary["calibration"]
-    if "estimated" in camera:
-        pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
-        lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
-        lines += [camera["caveat"]] if "caveat" in camera else []
-    if "better_focal" in camera:
-        better, fx = camera["better_focal"], camera["given"]["fx"]
-        lines.append(
-            f"a focal length fx of {fx * better['factor']:.0f} fits the matches better than the "
-            f"given {fx:.0f}: it reduces their squared errors by {1 - better['squares_left']:.0%}. "
-            "Is this the calibration of this camera, at this zoom and image size?"
+    if lens := summary["lens"]:
+        told = (
+            f"{key} {one['value']:.{digits}f} ± {one['sigma']:.{digits}f}"
+            for key, one in lens.items()
+            for digits in [1 if key in INTRINSICS else 3]
         )
+        lines += ["camera: " + ", ".join(told), *([camera["caveat"]] if "caveat" in camera else [])]
+    if "better_lens" in camera:
+        lines.append(_better(camera["better_lens"], camera["given"]))
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -250,24 +249,45 @@ def _unit_line(unit: Summary) -> str:
 def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -> Summary:
     """Return what the camera was taken for, and where it is estimated or considered, what it is in
     the end with σ: what is considered was found by the start, and left since. Where it is known,
-    by what factor focal lengths fit much better, if so."""
+    the lens that fits much better, if one does."""
     camera = tracker.camera()
     given = as_fields(tracker.calibration)
     if camera is None:
         return {"given": given}
-    treatment, mean, covariance = camera
-    result = {"treatment": treatment, "given": given}
-    if treatment in ("estimated", "consider"):
-        sigma = np.sqrt(np.diagonal(covariance))
-        result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
-        result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
-    if treatment == "estimated":
+    result = {"treatment": camera[0], "given": given}
+    if lens := _lens(tracker):
+        for key, number in (("estimated", "value"), ("sigma", "sigma")):
+            result[key] = {name: one[number] for name, one in lens.items() if name in INTRINSICS}
+    if camera[0] == "estimated":
         result["caveat"] = TOO_SURE
-    if treatment == "known":
-        factor, left = better_focal(history, points, tracker.calibration)
-        if left < CLEAR:
-            result["better_focal"] = {"factor": factor, "squares_left": left}
+    if camera[0] == "known":
+        better = better_lens(history, points, tracker.calibration)
+        if better.left < CLEAR:
+            result["better_lens"] = better.as_summary(tracker.calibration)
     return result
+
+
+def _lens(tracker: Tracker) -> Summary:
+    """Return what was estimated or considered of the lens, in pixels and, of k1 and k2, numbers."""
+    camera = tracker.camera()
+    if camera is None or camera[0] not in ("estimated", "consider"):
+        return {}
+    names = (*INTRINSICS, *MODELS[tracker.calibration.model].split())
+    sigma = np.sqrt(np.diagonal(camera[2]))
+    numbers = zip(names, camera[1].tolist(), sigma.tolist(), strict=False)
+    return {name: {"value": x, "sigma": s} for name, x, s in numbers if s > 0}
+
+
+def _better(better: Summary, given: Summary) -> str:
+    """Return the sentence that a lens was given which does not fit."""
+    fx, k1 = given["fx"], (given["distortion"] or [0.0])[0]
+    what = "LENS DISTORTION" if better["distortion"] else "LENS"
+    return (
+        f"{what}: fx {better['fx']:.0f} and k1 {better['k1']:.3f} fit the matches better than the "
+        f"given {fx:.0f} and {k1:.3f}: they reduce the squared errors by "
+        f"{1 - better['squares_left']:.0%}. Is this the calibration of this camera, at this zoom "
+        "and image size?"
+    )
 
 
 def _ungated(updates: Sequence[Tracked]) -> Summary:

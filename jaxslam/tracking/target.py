@@ -15,10 +15,13 @@ from jaxtyping import Float
 from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
+from jaxslam.tracking.optics import on_pinhole, rays
 from jaxslam.tracking.patches import Picture, Places
 from jaxslam.tracking.pose_with_covariance import Positions, Transform
 
 LEAST_POINTS = 4
+_IDEAL = np.zeros(0)
+"""No distortion."""
 _CORNER_REACH = 3
 """Pixels to each side in which the corner that a patch shows is measured."""
 _LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
@@ -126,11 +129,13 @@ def sighted(
     that the target fits best from some pose. Raises ValueError where it is not in the picture.
     """
     combined = map(np.array, itertools.product(*_places(target, image)))
-    lens = calibration.matrix, np.array(calibration.distortion)
-    positions = target.positions
-    pixels = min(combined, key=lambda pixels: _pose(positions, pixels, lens).rms)
-    pixels = _on_corners(target, image, pixels)
-    pose = _pose(positions, pixels, lens)
+    positions, K = target.positions, calibration.matrix
+
+    def posed(pixels: Places) -> _Pose:
+        return _pose(positions, on_pinhole(calibration, pixels)[0], K)
+
+    pixels = _on_corners(target, image, min(combined, key=lambda pixels: posed(pixels).rms))
+    pose = posed(pixels)
     sought = any(point.patch is not None for point in target.points)
     largest = _LARGEST_FOUND if sought else _LARGEST_RMS
     if not pose.rms <= largest:
@@ -138,7 +143,7 @@ def sighted(
             f"the first picture does not show the target: its points are off by {pose.rms:.2f} px "
             f"(RMS); the limit is {largest:g} px"
         )
-    return _sighting(positions, pixels, lens, pose, pixel_sigma)
+    return _sighting(positions, pixels, calibration, pose, pixel_sigma)
 
 
 def _places(target: Target, image: np.ndarray) -> list[list[Float[np.ndarray, " 2"]]]:
@@ -174,10 +179,6 @@ def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:
     return np.where(found[:, None], corners.astype(float), pixels)
 
 
-_Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " distortion"]]
-"""Intrinsics and distortion, as OpenCV takes them."""
-
-
 class _Pose(NamedTuple):
     """The target's frame in the camera as OpenCV has it, and the RMS in pixels that it leaves."""
 
@@ -186,13 +187,13 @@ class _Pose(NamedTuple):
     rms: float
 
 
-def _pose(positions: Positions, pixels: Places, lens: _Lens) -> _Pose:
+def _pose(positions: Positions, pixels: Places, K: Float[np.ndarray, "3 3"]) -> _Pose:
     """Return the pose from which the points are seen there (PnP); an infinite RMS where there is
     none."""
-    found, turn, shift = cv2.solvePnP(positions, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
+    found, turn, shift = cv2.solvePnP(positions, pixels, K, _IDEAL, flags=cv2.SOLVEPNP_SQPNP)
     if not found:
         return _Pose(np.zeros(3), np.zeros(3), np.inf)
-    seen, _ = cv2.projectPoints(positions, turn, shift, *lens)
+    seen, _ = cv2.projectPoints(positions, turn, shift, K, _IDEAL)
     depths = _in_camera(positions, turn, shift)[:, 2]
     # Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it.
     if not 0 < depths.max() <= 1.5 * depths.min():
@@ -205,17 +206,20 @@ def _in_camera(positions: Positions, turn: np.ndarray, shift: np.ndarray) -> Pos
 
 
 def _sighting(
-    positions: Positions, pixels: Places, lens: _Lens, pose: _Pose, pixel_sigma: float
+    positions: Positions, pixels: Places, calibration: Calibration, pose: _Pose, pixel_sigma: float
 ) -> TargetObservation:
-    turn, shift = cv2.solvePnPRefineLM(positions, pixels, *lens, pose.turn, pose.shift)
-    J = cv2.projectPoints(positions, turn, shift, *lens)[1][:, :6]
+    flat, K = on_pinhole(calibration, pixels)[0], calibration.matrix
+    turn, shift = cv2.solvePnPRefineLM(positions, flat, K, _IDEAL, pose.turn, pose.shift)
+    J = cv2.projectPoints(positions, turn, shift, K, _IDEAL)[1][:, :6]
     covariance = pixel_sigma**2 * np.linalg.pinv(J.T @ J)
     depths = _in_camera(positions, turn, shift)[:, 2]
     T_ct = np.eye(4)
     T_ct[:3, :3], T_ct[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     # n diag(P) ≥ P for any covariance P of n numbers.
     sigma = np.sqrt(len(depths)) * _depth_sigma(positions, turn, covariance) / depths**2
-    return TargetObservation(pixels, T_ct, 1 / depths, sigma, pose.rms)
+    # One over the lens's depth, of which a fisheye's is the distance.
+    share = rays(calibration, pixels)[:, 2]
+    return TargetObservation(pixels, T_ct, share / depths, share * sigma, pose.rms)
 
 
 def _depth_sigma(

@@ -320,8 +320,9 @@ class Tracker:
             return joined(self.state.joins, *smoothed(self.state, history))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
-        """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
-        as far as this map tells; None for a filter without a pinhole camera."""
+        """Return how the calibration is treated, and fx, fy, cx, cy in pixels, and k1 and k2 of a
+        lens that has them, with their covariance, as far as this map tells; None for a filter
+        without a pinhole camera."""
         with jax.enable_x64(True):
             return self.estimator.camera(self.state.map.state)
 

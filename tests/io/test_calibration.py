@@ -1,6 +1,7 @@
 """The calibration file: what is read back, and what is refused with which words."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,7 +117,8 @@ def test_short_distortion_is_padded(tmp_path, given):
     ("changes", "words"),
     [
         ({"fx": None, "cy": None}, "missing fx, cy"),
-        ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
+        ({"model": "omni"}, "unknown camera model 'omni'; expected pinhole, rational, fisheye"),
+        ({"model": "fisheye", "distortion": [0.0] * 5}, "has 5 entries; expected at most k1, k2"),
         ({"fx": -525.0}, "fx must be positive, not -525.0"),
         ({"fy": float("nan")}, "fy must be finite, not nan"),
         ({"cx": float("inf")}, "cx must be finite, not inf"),
@@ -220,14 +222,63 @@ def test_the_files_of_other_programs_are_read(tmp_path, name):
     assert read_calibration(tmp_path / name) == LENS
 
 
+FISHEYE = replace(LENS, distortion=(0.1, -0.2, 0.01, 0.02), model="fisheye")
+RATIONAL = replace(LENS, distortion=(0.1, -0.2, 0.01, 0.02, 0.0, 0.0, 0.0, 0.3), model="rational")
+EIGHT = "0.02, 0, 0, 0, 0.3]"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "lens"),
+    [
+        ("camchain.yaml", "radtan", "equidistant", FISHEYE),
+        ("camchain.yaml", "model: pinhole", "model: pinhole-equi", FISHEYE),
+        ("ros.yaml", "plumb_bob", "kannala_brandt", FISHEYE),
+        ("opencv.yaml", "---\n", "---\nfisheye_model: 1\n", FISHEYE),
+        ("cameras.txt", "OPENCV", "OPENCV_FISHEYE", FISHEYE),
+        ("orb.yaml", '"PinHole"', '"KannalaBrandt8"', FISHEYE),
+        ("ros.yaml", "0.02, 0]", EIGHT, RATIONAL),
+        ("opencv.yaml", "0.02, 0. ]", EIGHT, RATIONAL),
+        ("cameras.txt", "OPENCV", "FULL_OPENCV", RATIONAL),
+    ],
+)
+def test_wide_lenses_of_other_programs_are_read(tmp_path, name, old, new, lens):
+    text = OTHERS[name].replace(old, new)
+    if name == "orb.yaml":
+        text = text.replace("p1", "k3").replace("p2", "k4")
+    if lens is RATIONAL:
+        text = text.replace("plumb_bob", "rational_polynomial")
+        text = text.replace("0.01 0.02\n", "0.01 0.02 0 0 0 0.3\n")
+    (tmp_path / name).write_text(text)
+    assert read_calibration(tmp_path / name) == lens
+    write_calibration(tmp_path / "own.json", lens)
+    assert read_calibration(tmp_path / "own.json") == lens
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "lens"),
+    [
+        ("SIMPLE_PINHOLE", "525 309 237", replace(LENS, fy=525.0, distortion=())),
+        ("PINHOLE", "525 524 309 237", replace(LENS, distortion=())),
+        ("SIMPLE_RADIAL", "525 309 237 0.1", replace(LENS, fy=525.0, distortion=(0.1,))),
+        ("RADIAL", "525 309 237 0.1 -0.2", replace(LENS, fy=525.0, distortion=(0.1, -0.2))),
+        (
+            "RADIAL_FISHEYE", "525 309 237 0.1 -0.2",
+            replace(FISHEYE, fy=525.0, distortion=(0.1, -0.2)),
+        ),
+    ],
+)  # fmt: skip
+def test_colmaps_cameras_are_read(tmp_path, model, values, lens):
+    (tmp_path / "cameras.txt").write_text(f"1 {model} 640 480 {values}\n")
+    assert read_calibration(tmp_path / "cameras.txt") == lens
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new", "words"),
     [
-        ("camchain.yaml", "radtan", "equidistant", "unknown distortion_model 'equidistant' of 4"),
-        ("camchain.yaml", "pinhole", "omni", "unknown camera_model 'omni'"),
-        ("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0.3]", "of 8 numbers; expected plumb_bob"),
+        ("camchain.yaml", "pinhole", "omni", "unknown lens, omni radtan of 4 numbers; expected"),
+        ("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0, 0.3]", "of 9 numbers; expected plumb_bob"),
         ("ros.yaml", "image_width: 640\n", "", "has no image size or no camera matrix; its keys"),
-        ("cameras.txt", "OPENCV", "OPENCV_FISHEYE", "unknown camera model OPENCV_FISHEYE of 10"),
+        ("cameras.txt", "OPENCV", "FOV", "unknown camera model FOV of 10"),
     ],
 )
 def test_another_lens_of_another_program_is_refused(tmp_path, name, old, new, words):

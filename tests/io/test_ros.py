@@ -131,6 +131,22 @@ def test_without_a_lens_it_is_guessed(tmp_path):
             assert open_source(bag).calibration.guessed
 
 
+@pytest.mark.parametrize(
+    ("told", "model", "count"),
+    [
+        ("equidistant", "fisheye", 4),
+        ("kannala_brandt", "fisheye", 4),
+        ("rational_polynomial", "rational", 8),
+    ],
+)
+def test_wide_lenses_of_a_bag_are_read(tmp_path, told, model, count):
+    r, numbers = ros_of("run.bag"), tuple(np.linspace(0.1, 0.2, count).tolist())
+    told = info(r, model=told, D=numbers)
+    bag = write_bag(tmp_path / "run.bag", {TOPIC: pictures(r), "/camera/camera_info": told})
+    found = open_source(bag).calibration
+    assert (found.model, found.distortion) == (model, numbers)
+
+
 def refused(message, *given, **more):
     with pytest.raises(ValueError, match=message) as caught:
         list(open_source(*given, **more))
@@ -139,9 +155,9 @@ def refused(message, *given, **more):
 
 def test_another_lens_is_refused_unless_a_calibration_is_given(tmp_path, calibration):
     r = ros_of("run.bag")
-    told = info(r, model="equidistant")
+    told = info(r, model="omni")
     bag = write_bag(tmp_path / "run.bag", {TOPIC: pictures(r), "/camera/camera_info": told})
-    refused("run.bag:/camera/camera_info: unknown distortion_model 'equidistant' of 5 numbers", bag)
+    refused("run.bag:/camera/camera_info: unknown lens, omni of 5 numbers", bag)
     assert len(list(open_source(bag, calibration=calibration))) == 4
     told = info(r, K=np.diag([-1.0, 1, 1]))
     bag = write_bag(tmp_path / "k.bag", {TOPIC: pictures(r), "/camera/camera_info": told})

@@ -56,7 +56,11 @@ def empty(folder):
 
 YAML = "mav0/cam0/sensor.yaml"
 REFUSED = [
-    (euroc, instead(YAML, "radial-tangential", "equidistant"), "distortion_model 'equidistant'"),
+    (
+        euroc,
+        instead(YAML, "radial-tangential", "fov"),
+        r"yaml: unknown lens, pinhole fov of",
+    ),
     (euroc, instead(YAML, "61.5, ", ""), r"sensor\.yaml: has no image size or no camera matrix"),
     (euroc, instead(YAML, "60.5", "nan"), r"sensor\.yaml: fx must be finite, not nan"),
     (euroc, instead(YAML, "60.5", "-60.5"), r"sensor\.yaml: fx must be positive, not -60\.5"),
@@ -90,6 +94,20 @@ REFUSED = [
     (empty, nothing, "a folder with nothing in it, not a known kind"),
     (empty, deeper, r"a folder with a\.txt, deeper/, …, not a known .* EuRoC"),
 ]
+
+
+def test_tum_vi_has_the_fisheye_of_its_camchain(tmp_path):
+    path = euroc(tmp_path)
+    (path / YAML).unlink()
+    (path / "dso").mkdir()
+    size = f"resolution: [{WIDTH}, {HEIGHT}]"
+    (path / "dso" / "camchain.yaml").write_text(
+        f"cam0:\n  camera_model: pinhole\n  intrinsics: [60.5, 61.5, 31.0, 23.0]\n  {size}\n"
+        "  distortion_model: equidistant\n  distortion_coeffs: [0.003, 0.0007, -0.002, 0.0002]\n"
+    )
+    four = (0.003, 0.0007, -0.002, 0.0002)
+    lens = Calibration(WIDTH, HEIGHT, 60.5, 61.5, 31.0, 23.0, four, model="fisheye")
+    assert open_source(path).calibration == lens
 
 
 @pytest.mark.parametrize(("write", "spoil", "message"), REFUSED)

@@ -1,19 +1,34 @@
 """Tests of jaxslam.models.camera: projection against OpenCV, its inverse, scale and derivatives."""
 
+import pickle
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import central, quick_jit
 
-from jaxslam.models.camera import Camera, bearing, distort, project
+from jaxslam import cast
+from jaxslam.models.camera import Camera, project, ray
+from jaxslam.models.lens import Fisheye, RadialTangential, Rational
 
 IDEAL = Camera(jnp.array([525.0, 524.0]), jnp.array([308.6, 236.5]))
 # The real camera of shared/data/costado.
-WIDE = Camera(IDEAL.focal, IDEAL.centre, jnp.array([0.107, -0.181, 0.0, 0.0, 0.0]))
-SKEWED = Camera(IDEAL.focal, IDEAL.centre, jnp.array([-0.21, 0.06, 0.002, -0.003, 0.01]))
+WIDE = Camera(IDEAL.focal, IDEAL.centre, RadialTangential(0.107, -0.181))
+SKEWED = Camera(IDEAL.focal, IDEAL.centre, RadialTangential(-0.21, 0.06, 0.002, -0.003, 0.01))
+RATIONAL = Camera(
+    jnp.array([400.0, 401.0]), IDEAL.centre,
+    Rational(1.2, 0.1, 2e-4, -1e-4, 0.004, 1.5, 0.35, 0.02),
+)  # fmt: skip
+# TUM-VI's, 195° across the corners, and one that sees farther back.
+FISHEYE = Camera(jnp.array([238.3, 238.3]), IDEAL.centre, Fisheye(0.0034, 0.0007, -0.002, 0.0002))
+EQUIDISTANT = Camera(jnp.array([180.0, 181.0]), IDEAL.centre, Fisheye())
 LINE = Camera(jnp.array([650.0]), jnp.array([320.0]))
-CAMERAS = {"ideal": IDEAL, "wide": WIDE, "skewed": SKEWED}
+CAMERAS = {
+    "ideal": IDEAL, "wide": WIDE, "skewed": SKEWED, "rational": RATIONAL, "fisheye": FISHEYE,
+    "equidistant": EQUIDISTANT,
+}  # fmt: skip
 
 each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 
@@ -29,33 +44,93 @@ def test_project_agrees_with_opencv(camera):
     cv2 = pytest.importorskip("cv2")
     matrix = np.diag([*camera.focal, 1.0])
     matrix[:2, 2] = camera.centre
-    distortion = np.zeros(5) if camera.distortion is None else np.asarray(camera.distortion)
-    X = points(200)
-    theirs = cv2.projectPoints(X, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
+    numbers = np.array(jax.tree.leaves(camera.lens) or np.zeros(4))
+    X, still = points(200), np.zeros(3)
+    if isinstance(camera.lens, Fisheye):
+        X[:, :2] *= 20  # up to 85° from the axis; OpenCV goes no farther than 90°
+        theirs = cv2.fisheye.projectPoints(X[:, None], still, still, matrix, numbers)[0][:, 0]
+    else:
+        theirs = cv2.projectPoints(X, still, still, matrix, numbers)[0][:, 0]
     ours = jax.vmap(project, in_axes=(None, 0))(camera, X)
     # Rounding of numbers of a few hundred pixels.
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
 
 
 @each_camera
-def test_bearing_is_the_inverse_of_project_over_the_whole_picture(camera):
+def test_ray_is_the_inverse_of_project_over_the_whole_picture(camera):
     u, v = np.meshgrid(np.linspace(0, 640, 65), np.linspace(0, 480, 49))
     pixels = np.column_stack([u.ravel(), v.ravel()])
 
     def there_and_back(pixel):
-        return project(camera, 3.0 * jnp.append(bearing(camera, pixel), 1.0))
+        X = ray(camera, pixel)
+        return project(camera, 3.0 * X), camera.lens.depth(X), camera.lens.sees(X), X[-1]
 
-    again = quick_jit(jax.vmap(there_and_back))(pixels)
+    again, depth, seen, z = quick_jit(jax.vmap(there_and_back))(pixels)
     np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(depth, 1, rtol=1e-12)
+    assert seen.all()
+    # 90° is 283 pixels from the centre of the equidistant one.
+    assert (z.min() < -0.4) == (camera is EQUIDISTANT)
 
 
-@pytest.mark.parametrize("camera", [WIDE, pytest.param(SKEWED, marks=pytest.mark.slow)])
-def test_the_derivatives_of_bearing_are_those_of_central_differences(camera):
+@each_camera
+def test_a_camera_in_single_precision_stays_in_it_and_is_nearly_as_exact(camera):
+    single, pixel = cast(camera, "float32"), jnp.array([500.0, 50.0], jnp.float32)
+    X = quick_jit(partial(ray, single))(pixel)
+    again = quick_jit(partial(project, single))(X)
+    assert X.dtype == again.dtype == jnp.float32
+    np.testing.assert_allclose(X, ray(camera, pixel), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(again, pixel, rtol=0, atol=2e-3)
+
+
+@each_camera
+def test_a_lens_is_equal_by_value_and_survives_a_pickle(camera):
+    again = pickle.loads(pickle.dumps(camera.lens))
+    assert type(again) is type(camera.lens)
+    assert again == camera.lens
+    assert (camera.lens == type(camera.lens)()) == (camera in (IDEAL, EQUIDISTANT))
+
+
+def test_a_lens_does_not_see_what_its_model_would_fold_back_into_the_picture():
+    """`r (1 − .3 r²)` is largest at r = 1.054, and small again at 1.8."""
+    lens = RadialTangential(-0.3)
+    for r, seen in ((0.9, True), (1.0, True), (1.1, False), (1.8, False)):
+        assert lens.sees(jnp.array([0.6 * r, 0.8 * r, 1.0])) == seen
+    assert not lens.sees(jnp.array([0.1, 0.1, -1.0]))
+    # `θ (1 − .2 θ²)` at 1.291 rad.
+    folded = Fisheye(-0.2)
+    for angle, seen in ((0.0, True), (1.28, True), (1.3, False), (2.0, False)):
+        assert folded.sees(jnp.array([jnp.sin(angle), 0.0, jnp.cos(angle)])) == seen
+        assert Fisheye().sees(jnp.array([jnp.sin(angle), 0.0, jnp.cos(angle)]))
+    assert not Fisheye().sees(jnp.array([0.0, 0.0, -1.0]))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 3e-5, 0.1, 1.57, 2.4])
+def test_a_fisheye_and_its_derivatives_are_right_at_the_axis_and_beyond_a_right_angle(angle):
+    X = jnp.array([0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle)])
+    lens = FISHEYE.lens
+    np.testing.assert_allclose(lens.flat(7 * X), angle * jnp.array([0.6, 0.8]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lens.undistort(lens.distort(X)), X, rtol=0, atol=1e-12)
+    J = jax.jacfwd(lens.distort)(X)
+    np.testing.assert_allclose(J, central(lens.distort, X, 1e-6), rtol=0, atol=1e-8)
+    back = jax.jacfwd(lens.undistort)(lens.distort(X))
+    np.testing.assert_allclose(J @ back, np.eye(2), rtol=0, atol=1e-9)
+    twice = jax.jacfwd(jax.jacfwd(lens.distort))(X)
+    steps = central(jax.jacfwd(lens.distort), X, 1e-5)
+    np.testing.assert_allclose(twice, steps, rtol=0, atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [WIDE, RATIONAL, FISHEYE, pytest.param(SKEWED, marks=pytest.mark.slow)],
+    ids=["wide", "rational", "fisheye", "skewed"],
+)
+def test_the_derivatives_of_ray_are_those_of_central_differences(camera):
     """By the pixel and by the lens, in both modes, and by the pixel twice."""
-    pixel, lens = jnp.array([120.0, 400.0]), jnp.asarray(camera.distortion)
+    pixel, lens = jnp.array([120.0, 400.0]), jnp.stack(jax.tree.leaves(camera.lens))
 
     def of_both(both):
-        return bearing(Camera(camera.focal, camera.centre, both[2:]), both[:2])
+        return ray(Camera(camera.focal, camera.centre, type(camera.lens)(*both[2:])), both[:2])
 
     @quick_jit
     def derivatives(both):
@@ -69,8 +144,8 @@ def test_the_derivatives_of_bearing_are_those_of_central_differences(camera):
     np.testing.assert_allclose(forward, differences[:, :2], atol=1e-11)
     np.testing.assert_allclose(backward[:, :2], differences[:, :2], atol=1e-11)
     np.testing.assert_allclose(backward[:, 2:], differences[:, 2:], atol=1e-9)
-    second = quick_jit(jax.jacfwd(jax.jacfwd(lambda pixel: bearing(camera, pixel))))(pixel)
-    np.testing.assert_allclose(second, twice, atol=1e-12)
+    second = quick_jit(jax.jacfwd(jax.jacfwd(lambda pixel: ray(camera, pixel))))(pixel)
+    np.testing.assert_allclose(second, twice, atol=1e-11)
 
 
 def test_planar_camera_is_the_spatial_one_with_y_zero():
@@ -80,8 +155,8 @@ def test_planar_camera_is_the_spatial_one_with_y_zero():
         # Rounding of hundreds of pixels, and of numbers below 1.
         pixel = project(camera, jnp.array([x, 0.0, z]))
         np.testing.assert_allclose(pixel, [u[0], camera.centre[1]], rtol=0, atol=1e-12)
-        ray = bearing(camera, jnp.array([u[0], camera.centre[1]]))
-        np.testing.assert_allclose(ray, [bearing(LINE, u)[0], 0.0], rtol=0, atol=1e-15)
+        there = ray(camera, jnp.array([u[0], camera.centre[1]]))
+        np.testing.assert_allclose(there, [ray(LINE, u)[0], 0.0, 1.0], rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 7.3, 1e6])
@@ -95,10 +170,16 @@ def test_projection_does_not_depend_on_the_scale_of_the_point(camera, scale):
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize(
     ("camera", "point"),
-    [(LINE, [1.0, 0.0]), (WIDE, [1.0, 2.0, 0.0]), (IDEAL, [0.0, 0.0, 0.0])],
-    ids=["line", "wide", "ideal"],
+    [
+        (LINE, [1.0, 0.0]),
+        (WIDE, [1.0, 2.0, 0.0]),
+        (IDEAL, [0.0, 0.0, 0.0]),
+        (FISHEYE, [0.0, 0.0, 0.0]),
+        (FISHEYE, [0.0, 0.0, -1.0]),
+    ],
+    ids=["line", "wide", "ideal", "nowhere", "behind"],
 )
-def test_derivative_at_zero_depth_is_finite(camera, point, mode):
+def test_derivative_where_nothing_is_seen_is_finite(camera, point, mode):
     point = jnp.array(point)
     assert np.isfinite(project(camera, point)).all()
     assert np.isfinite(mode(project, argnums=1)(camera, point)).all()
@@ -107,14 +188,39 @@ def test_derivative_at_zero_depth_is_finite(camera, point, mode):
 def test_perturbed_moves_the_intrinsics_and_keeps_the_lens():
     delta = jnp.array([1.0, -2.0, 3.0, -4.0])
     moved = WIDE.perturbed(delta)
-    np.testing.assert_array_equal(moved.intrinsics, WIDE.intrinsics + delta)
-    np.testing.assert_array_equal(moved.distortion, WIDE.distortion)
+    np.testing.assert_array_equal(moved.intrinsics[:4], WIDE.intrinsics[:4] + delta)
+    assert moved.lens == WIDE.lens
     # u = f d(x/z) + c: by hand, what the shift of f and c does to a pixel.
     X = jnp.asarray(points(1)[0])
-    d = distort(X[:2] / X[2], WIDE.distortion)
+    d = WIDE.lens.distort(X)
     np.testing.assert_allclose(
         project(moved, X) - project(WIDE, X), delta[:2] * d + delta[2:], rtol=0, atol=1e-10
     )
+
+
+@pytest.mark.parametrize("camera", [WIDE, RATIONAL, FISHEYE], ids=["wide", "rational", "fisheye"])
+@pytest.mark.parametrize("delta", [[3.0, -1, 2, 0.05, -0.02], [3.0, 3, -1, 2, 0.05, -0.02]])
+def test_perturbed_moves_k1_and_k2_of_a_lens_that_is_not_known(camera, delta):
+    moved = camera.perturbed(jnp.array(delta))
+    change = np.array([3.0, 3, -1, 2, 0.05, -0.02])
+    np.testing.assert_allclose(moved.intrinsics, camera.intrinsics + change, rtol=1e-15)
+    others = jax.tree.leaves(moved.lens)[2:]
+    assert others == jax.tree.leaves(camera.lens)[2:]
+    # By hand: u = f (d + Δ(k1 r² + k2 r⁴) x) + c of a lens without another denominator.
+    if camera is not RATIONAL:
+        X = jnp.array([0.3, -0.2, 1.0])
+        x = camera.lens.flat(X)
+        bent = camera.lens.distort(X) + x * (0.05 * x @ x - 0.02 * (x @ x) ** 2)
+        expected = moved.focal * bent + moved.centre
+        np.testing.assert_allclose(project(moved, X), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("delta", [[1.0, 2, 3, 4, 5, 6], [1.0, 2, 3, 4, 5]])
+def test_an_ideal_lens_has_no_k1(delta):
+    with pytest.raises(ValueError, match="Ideal has no coefficients that could be uncertain"):
+        IDEAL.perturbed(jnp.array(delta))
+    with pytest.raises(ValueError, match="too many values"):
+        WIDE.perturbed(jnp.ones(7))
 
 
 def test_an_empty_perturbation_means_a_known_camera():
@@ -137,7 +243,7 @@ def test_derivatives_agree_with_central_differences(camera):
     delta = np.array([0.5, -0.5, 1.0, 2.0])
     functions = {
         "project": (lambda x: project(camera, x), X),
-        "bearing": (lambda u: bearing(camera, u), pixel),
+        "ray": (lambda u: ray(camera, u), pixel),
         "intrinsics": (lambda d: project(camera.perturbed(d), seen), delta),
     }
     for name, (function, at) in functions.items():

@@ -1,4 +1,4 @@
-"""A focal length that is 20 % off is noticed, and a right one never called wrong."""
+"""A lens that is wrong is noticed, and a right one never called so."""
 
 from dataclasses import replace
 
@@ -11,8 +11,9 @@ pytest.importorskip("cv2")
 import cv2
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.focal import CLEAR, FACTOR, better_focal
+from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.report import Tracked
 
@@ -44,35 +45,54 @@ def video(seed=0, turn=0.15, move=1.0, frames=30, points=60):
     )
 
 
-def times(factor):
-    return replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+def given(factor=1.0, k1=0.0):
+    """A calibration that is wrong by so much."""
+    distortion = (CAMERA.distortion[0] + k1, *CAMERA.distortion[1:])
+    return replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor, distortion=distortion)
 
 
-@pytest.mark.parametrize("off", [FACTOR, 1 / FACTOR])
-def test_the_focal_length_that_fits_is_found(off):
-    factor, left = better_focal(*video(), times(off))
-    assert factor == pytest.approx(1 / off)
-    assert left < 0.5 * CLEAR
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.2])
+@pytest.mark.parametrize("k1", [-0.08, 0.0, 0.08])
+def test_the_lens_that_fits_is_found(factor, k1):
+    found = better_lens(*video(turn=0.3), given(factor, k1))
+    assert (found.left < 0.6 * CLEAR) == ((factor, k1) != (1.0, 0.0))
+    assert (found.left > 0.9) == ((factor, k1) == (1.0, 0.0))
+    off = np.array([np.log(found.focal * factor), found.k1 + k1])
+    assert (np.abs(off) < 4 * found.sigma).all()
+    assert (found.sigma < [0.02, 0.02]).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_right_one_is_left_alone(seed):
-    assert better_focal(*video(seed), CAMERA)[1] > 1
+    assert better_lens(*video(seed), CAMERA).left > 0.9
+
+
+def test_a_fisheye_is_adjusted_as_well():
+    fisheye = replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0), model="fisheye")
+    history, points = video(turn=0.3)
+    draw = np.random.default_rng(5)
+    for result in history:
+        T_wc = result.T_wc
+        X = (points.points - T_wc[:3, 3]) @ T_wc[:3, :3]
+        pixels = sighted(fisheye, X).pixels + draw.normal(0, 0.2, (len(X), 2))
+        result.sights.update(enumerate(pixels))
+    assert better_lens(history, points, fisheye).left > 0.9
+    found = better_lens(history, points, replace(fisheye, distortion=(0.0, 0.0, 0.0, 0.0)))
+    assert found.left < CLEAR
+    assert found.k1 == pytest.approx(0.1, abs=0.03)
 
 
 def test_where_nothing_tells_nothing_is_said():
     """Of a camera that does not turn before a few points, and of one picture."""
     history, points = video(turn=0.0, move=0.05)
-    assert better_focal(history, points, times(FACTOR))[1] > CLEAR
-    assert better_focal(history[:1], points, times(FACTOR))[1] == 1
+    assert better_lens(history, points, given(1.2)).left > CLEAR
+    assert better_lens(history[:1], points, given(1.2)).left == 1
 
 
 def test_a_view_that_shares_nothing_is_left_out():
     history, points = video()
     history[-1].sights.clear()
-    factor, left = better_focal(history, points, times(FACTOR))
-    assert factor == 1 / FACTOR
-    assert left < CLEAR
+    assert better_lens(history, points, given(1.2)).left < CLEAR
 
 
 def test_landmarks_at_infinity_and_outliers_do_no_harm():
@@ -81,7 +101,7 @@ def test_landmarks_at_infinity_and_outliers_do_no_harm():
     points.points[5:9] = np.nan
     for result in history[::3]:
         result.sights[20] += 50
-    factor, left = better_focal(history, points, times(FACTOR))
-    assert factor == 1 / FACTOR
-    assert left < CLEAR
-    assert better_focal(history, points, CAMERA)[1] > 1
+    found = better_lens(history, points, given(1.2))
+    assert found.focal == pytest.approx(1 / 1.2, rel=0.05)
+    assert found.left < CLEAR
+    assert better_lens(history, points, CAMERA).left > 0.9

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam._runtime.programs import _Call, exactly
-from jaxslam.io.calibration import Calibration, from_field_of_view
+from jaxslam.io.calibration import LENS_SIGMA, Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
@@ -22,11 +22,11 @@ GUESSED = from_field_of_view(640, 480)
     [
         (None, PLAIN, Known, ()),
         (None, STATED, Known, ()),
-        (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8)),
+        (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
         ("known", GUESSED, Known, ()),
         ("estimated", STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
         ("white", PLAIN, White, (0.7, 0.7, 0.6, 0.6)),
-        ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8)),
+        ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
     ],
 )
 def test_a_guess_is_estimated_and_stated_sigmas_are_used(name, calibration, kind, sigma):
@@ -47,7 +47,7 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     assert tracked.state == "tracked"
     camera = tracker.camera()
     assert camera is not None
-    treatment, (fx, fy, cx, cy), covariance = camera
+    treatment, (fx, fy, cx, cy, *_), covariance = camera
     assert treatment == "estimated"
     assert fx == fy
     # Measured: of 34 pixels 11 to 20 are left after 1.5 seconds, from a guess with a σ of 11. One
@@ -69,7 +69,7 @@ def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_that_are_kn
     guesses = programs(GUESSED, from_field_of_view(640, 480, 50.0), from_field_of_view(1280, 720))
     known = programs(PLAIN, STATED, Calibration(320, 240, 250.0, 260.0, 160.0, 120.0))
     assert len(guesses) == len(known) == 1
-    # One state has three numbers more than the other.
+    # One state has five numbers more than the other.
     assert guesses != known
 
 

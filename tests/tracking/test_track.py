@@ -16,6 +16,7 @@ from jaxslam.cli.track import TrackOptions
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.tracking import overlay, summary
 from jaxslam.tracking import video as tracking
+from jaxslam.tracking.focal import BetterLens
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
@@ -129,19 +130,37 @@ def test_what_ends_before_a_frame_is_timed_leaves_the_files_all_the_same(tmp_pat
 
 @pytest.mark.parametrize(("left", "said"), [(0.5, True), (0.9, False)])
 def test_a_focal_length_that_does_not_fit_is_told(tmp_path, monkeypatch, left, said):
-    monkeypatch.setattr(summary, "better_focal", lambda *_: (1 / 1.2, left))
+    found = BetterLens(1 / 1.2, -0.1, np.array([0.01, 0.02]), left)
+    monkeypatch.setattr(summary, "better_lens", lambda *_: found)
     written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    told = "a focal length fx of 109 fits the matches better than the given 131: "
-    told += "it reduces their squared errors by 50%"
+    told = "LENS: fx 109 and k1 -0.100 fit the matches better than the given 131 and 0.000: "
+    told += "they reduce the squared errors by 50%"
     assert (told in summary.describe(written)) == said
-    assert ("better_focal" in written["calibration"]) == said
+    assert ("better_lens" in written["calibration"]) == said
+
+
+def test_a_distortion_that_nobody_told_is_told_loudly(tmp_path, monkeypatch):
+    found = BetterLens(1.01, -0.08, np.array([0.01, 0.02]), 0.4)
+    monkeypatch.setattr(summary, "better_lens", lambda *_: found)
+    written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
+    assert "LENS DISTORTION: fx 133 and k1 -0.080 fit" in summary.describe(written)
+    assert written["calibration"]["better_lens"]["k1"] == -0.08
+    assert written["calibration"]["better_lens"]["distortion"]
 
 
 def test_a_focal_length_that_is_estimated_is_not_tried(monkeypatch):
-    monkeypatch.setattr(summary, "better_focal", fail)
+    monkeypatch.setattr(summary, "better_lens", fail)
     guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
     nothing = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
-    assert "better_focal" not in summary._calibration(guessed, [], nothing)
+    assert "better_lens" not in summary._calibration(guessed, [], nothing)
+
+
+def test_what_was_estimated_of_a_lens_is_told_by_name_with_its_sigma():
+    guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
+    lens = summary._lens(guessed)
+    assert list(lens) == ["fx", "fy", "cx", "cy", "k1", "k2"]
+    assert lens["k1"] == {"value": 0.0, "sigma": pytest.approx(0.15)}
+    assert summary._lens(Tracker(small(1).calibration, SETTINGS)) == {}
 
 
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):

@@ -19,6 +19,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations, Slots
+from jaxslam.tracking.optics import on_pinhole
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import ByNumber, candidates, described_corners
 from jaxslam.tracking.policy import Policy
@@ -53,13 +54,14 @@ def pose_of(
     None if `FEWEST` of them cannot be seen at once."""
     if len(points) < FEWEST:
         return None
-    K, distortion = calibration.matrix, np.array(calibration.distortion, float)
+    flat, within = on_pinhole(calibration, pixels)
+    near, K, nothing = np.flatnonzero(within), calibration.matrix, np.zeros(0)
     # OpenCV refuses, by exception, a sample of points that are one, by an absolute distance.
     unit = max(float(points.std()), 1e-12) / 10
-    points = points / unit
+    points, pixels = points[near] / unit, flat[near]
     try:
         found, turn, shift, inside = cv2.solvePnPRansac(
-            points, pixels, K, distortion, iterationsCount=500, reprojectionError=PIXELS,
+            points, pixels, K, nothing, iterationsCount=500, reprojectionError=PIXELS,
             flags=cv2.SOLVEPNP_SQPNP,
         )  # fmt: skip
     except cv2.error:
@@ -67,10 +69,10 @@ def pose_of(
     if not found or inside is None or len(inside) < FEWEST:
         return None
     which = inside[:, 0].astype(int)
-    turn, shift = cv2.solvePnPRefineLM(points[which], pixels[which], K, distortion, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(points[which], pixels[which], K, nothing, turn, shift)
     T_cw = np.eye(4)
     T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], unit * shift[:, 0]
-    return np.linalg.inv(T_cw), which
+    return np.linalg.inv(T_cw), near[which]
 
 
 def known_again(
