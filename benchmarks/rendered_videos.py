@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -131,10 +131,13 @@ def _part(body: Body, T_wc, coarse: Float[np.ndarray, "h w 3"]) -> tuple[slice, 
     near = coarse @ (to_centre / away).astype(np.float32) >= least
     if not near.any():
         return None
-    return tuple(
-        slice(max(int(hit[0]) - 1, 0) * _APART, (int(hit[-1]) + 2) * _APART)
-        for hit in (np.flatnonzero(near.any(axis=1 - axis)) for axis in (0, 1))
-    )
+    rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
+    return _around(rows), _around(columns)
+
+
+def _around(hit: Int[np.ndarray, " n"]) -> slice:
+    """The pixels about the coarse rays from the first that hits to the last."""
+    return slice(max(int(hit[0]) - 1, 0) * _APART, (int(hit[-1]) + 2) * _APART)
 
 
 def _hit(body: Body, T_wc, rays: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
