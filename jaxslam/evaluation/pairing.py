@@ -154,7 +154,7 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
     if unused := len(text.times) - used:
         left_out["covariances are at no time of the estimate"] = unused, len(text.times)
-    those = evaluated_poses(run.estimate.parent, log.times, exactly_known(P))
+    those = evaluated_poses(run.estimate.parent, raw.times, exactly_known(P))
     result = RunLog(
         run,
         times,
