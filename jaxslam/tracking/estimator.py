@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -116,12 +117,15 @@ class Estimator:
         """Begin with a map without landmarks."""
         self.state = _empty(self.slam, self.settings.capacity)
 
-    def predict(self, seconds: float | np.ndarray) -> Predicted:
-        """Return what the filter expects so many seconds after the frame before. Changes
-        nothing."""
+    def predict(self, seconds: float | np.ndarray, livelier: float = 1.0) -> Predicted:
+        """Return what the filter expects so many seconds after the frame before, of a camera whose
+        accelerations have so many times their σ. Changes nothing."""
         # A number of Python's would be compiled into the program.
-        dt = np.asarray(seconds)
-        (state, gaussian), joint, view = _predict(self.slam, self.state, dt)
+        dt, slam = np.asarray(seconds), self.slam
+        if livelier != 1.0 and isinstance(slam, AbstractSlam):
+            noise = livelier * slam.motion.noise_sigma
+            slam = eqx.tree_at(lambda one: one.motion.noise_sigma, slam, noise)
+        (state, gaussian), joint, view = _predict(slam, self.state, dt)
         joint, view = jax.device_get((joint, view))
         return Predicted(dt, state, gaussian, joint, Prediction(*view))
 

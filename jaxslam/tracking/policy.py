@@ -43,6 +43,10 @@ less likely than `BY_CHANCE`."""
 MOST = 2 / 3
 """The share of the proven landmarks searched that must agree before a frame after such a one is
 believed."""
+JERK = 4.0
+"""σ of the accelerations of a camera that is jerked, in σ of others: 24 rad/s² of a hand's."""
+JERKED = (Lost.FEW_AGREE, Lost.CONTRADICTED)
+"""Why a frame is believed in only of such a camera."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]
