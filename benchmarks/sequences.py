@@ -48,8 +48,8 @@ ENOUGH = 0.8
 SEEDS = range(5)
 """Of synthetic videos."""
 
-ON_VIDEO = "scale_gauge+oc+scene50+walk3+drift+mixture3+rest8"
-"""What `recommended+walk3+drift` is of a video, whose start nobody knows: the tracker's own."""
+ON_VIDEO = "scale_gauge+oc+scene50+walk3+drift20+mixture3+rest8"
+"""What `recommended+walk3+drift20` is of a video, whose start nobody knows: the tracker's own."""
 WORLD_CENTRIC = "world_gauge+oc+scene50+drift+mixture3+rest8"
 """The same with landmarks in the base frame, and a common error of depths that stays."""
 OWN = f"{ON_VIDEO}/{LANDMARKS}"

@@ -15,7 +15,7 @@ from jaxslam.io.text import text_lines
 
 FRAMES = "frames.csv"
 _COLUMNS = ("time", "state", "map", "unit_fixed")
-_TIME = r"-?\d+(\.\d*)?(e[-+]\d+)?"
+_ROW = re.compile(r"-?\d+(\.\d*)?,\w+,\d{1,6},[01]")
 _FRAME = "a finite time, a state, the number of a map, and unit_fixed 0 or 1"
 
 
@@ -85,21 +85,14 @@ def read_frames(path: Path) -> FrameLog | None:
         return None
     # Reasons are words with spaces, and most cells of the last columns are empty: nobody's table.
     titles, *rows = (line.split(",") for line in told.values() or [""])
-    if not set(_COLUMNS) <= set(titles):
+    if not rows or not set(_COLUMNS) <= set(titles):
         return None
-    time, state, number, fixed = (titles.index(name) for name in _COLUMNS)
+    columns = [titles.index(name) for name in _COLUMNS]
     for line, row in zip(list(told)[1:], rows, strict=True):
-        finite = len(row) == len(titles) and re.fullmatch(_TIME, row[time])
-        if not (finite and re.fullmatch(r"\d{1,6}", row[number]) and row[fixed] in ("0", "1")):
+        if len(row) != len(titles) or not _ROW.fullmatch(",".join(row[i] for i in columns)):
             raise ValueError(f"{path}, line {line}: expected {_FRAME}")
-    if not rows:
-        raise ValueError(f"{path} has no frames; expected lines of {_FRAME}")
-    return FrameLog(
-        np.array([float(row[time]) for row in rows]),
-        np.array([row[state] == "lost" for row in rows]),
-        np.array([int(row[number]) for row in rows]),
-        np.array([row[fixed] == "1" for row in rows]),
-    )
+    time, state, number, fixed = np.array(rows)[:, columns].T
+    return FrameLog(time.astype(float), state == "lost", number.astype(int), fixed == "1")
 
 
 def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:

@@ -44,9 +44,7 @@ MOST = 2 / 3
 """The share of the proven landmarks searched that must agree before a frame after such a one is
 believed."""
 JERK = 4.0
-"""σ of the accelerations of a camera that is jerked, in σ of others: 24 rad/s² of a hand's."""
-JERKED = (Lost.FEW_AGREE, Lost.CONTRADICTED)
-"""Why a frame is believed in only of such a camera."""
+"""σ of the accelerations of a camera that is jerked, in that of others: motions have tails."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]

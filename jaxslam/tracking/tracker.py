@@ -27,7 +27,7 @@ from jaxslam.tracking.places.descriptors import note_looks
 from jaxslam.tracking.places.joining import LOOKED_EVERY, Join, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
-from jaxslam.tracking.policy import JERK, JERKED, LEAST_MATCHES, Policy
+from jaxslam.tracking.policy import JERK, LEAST_MATCHES, Policy
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import trackable, with_target
@@ -240,15 +240,14 @@ class Tracker:
             self.map.seen = None  # nobody is to come back to it
             self.map.coast(predicted)
             return self._lost(frame, Lost.REVERSED)
-        lost = self.unmeasured > 0
-        doubtful = self.policy.doubtful
+        lost, policy = self.unmeasured > 0, replace(self.policy)
         seen, reason = self.policy.observed(frame.image, self.map, predicted, lost=lost)
-        if reason in JERKED and not lost and self.map.place.unit_fixed:
-            jerked = self.map.estimator.predict(frame.time - before, JERK)
-            again = replace(self.policy, doubtful=doubtful)
-            found, why = again.observed(frame.image, self.map, jerked, lost=lost)
-            if why is None:  # all matches tell of one motion, which was not to be expected
-                self.policy, predicted, seen, reason = again, jerked, found, None
+        if not lost and self.map.place.unit_fixed:
+            jerked = self.map.estimator.predict(predicted.dt, JERK)
+            if reason is not None or self.map.estimator.likelier(jerked, predicted, seen):
+                found, why = policy.observed(frame.image, self.map, jerked, lost=lost)
+                if why is None:
+                    self.policy, predicted, seen, reason = policy, jerked, found, None
         if reason is not None:
             self.map.remember()
         # Of two motions that contradict each other a place that is known says no more: it is one of
