@@ -19,7 +19,7 @@ import numpy as np
 from benchmark import RESULTS, Benchmark, number, table, write_table
 from rendered_videos import KINDS, rendered_source
 from scipy.stats import chi2
-from sequences import beyond_scale
+from sequences import evaluated
 from starts import LIE
 
 from jaxslam.tracking.settings import TrackerSettings
@@ -63,7 +63,7 @@ def measure(source) -> dict[str, Any]:
     """The numbers of one video."""
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, TrackerSettings(), overlay=False)
-        poses = beyond_scale(source, Path(folder))
+        found = evaluated(source, Path(folder))
     numbers = {
         key: summary[key]
         for key in ("frames", "tracked", "maps", "loops", "loops_refused", "matches_per_frame")
@@ -75,13 +75,14 @@ def measure(source) -> dict[str, Any]:
         numbers["straight_line"] = ate["straight_line"] / ate["path_length"]
         numbers["sign"] = ate["sign"]
         numbers["orientation"] = ate["orientation_rmse"]
-    if poses:
-        _, found, normalised = poses
-        numbers["beyond_scale"] = float(np.mean(found.nees / 6))
-        numbers["median_beyond_scale"] = float(np.median(found.nees / 6))
-        numbers["lies"] = float(np.mean(chi2.sf(found.nees, 6) < LIE))
-        if np.isfinite(normalised).any():  # a camera on the spot has no scale
-            numbers["drift"] = float(np.sqrt(np.nanmean(normalised**2)))
+    if found is not None:
+        nees = found.mean[np.isfinite(found.mean)]
+        numbers["beyond_scale"] = float(np.mean(nees / found.dof))
+        numbers["median_beyond_scale"] = float(np.median(nees / found.dof))
+        numbers["lies"] = float(np.mean(chi2.sf(nees, found.dof) < LIE))
+        numbers |= {f"inside{name}": share for name, share in found.coverage.items()}
+        if found.scale is not None and np.isfinite(found.scale.factor):  # of a camera that moves
+            numbers["drift"] = found.scale.factor
     return {key: float(f"{value:.4g}") for key, value in numbers.items()}
 
 

@@ -540,6 +540,12 @@ def _looking(times: np.ndarray, rng: np.random.Generator) -> Poses:
     return _posed(walk, np.radians(75) * np.sin(2 * np.pi * times / 12), pitch, roll)
 
 
+def _looking_round(times: np.ndarray, rng: np.random.Generator) -> Poses:
+    """A hand on the spot that looks 75° to both sides, at up to 90°/s; it moves by a centimetre."""
+    x, y, z, pitch, roll = _sway(times, rng, 0.01, 0.01, 0.01, 0.06, 0.03)
+    return _posed(np.stack([x, y, z], 1), np.radians(75) * np.sin(1.2 * times), pitch, roll)
+
+
 def _driving(times: np.ndarray, rng: np.random.Generator) -> Poses:
     """10 m/s, with the small pitching of a car."""
     y, pitch, roll = _sway(times, rng, 0.01, 0.004, 0.003)
@@ -568,6 +574,7 @@ KINDS = {
     "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round such an object"),
     "turn": Kind(150, 30, _room, _turning, "a walk with a turn of 60°/s"),
     "spin": Kind(600, 10, _room, _spinning, "a minute of pure rotation at 30°/s"),
+    "look-round": Kind(180, 30, _room, _looking_round, "a hand on the spot that turns by 90°/s"),
     "look-around": Kind(500, 20, _room, _looking, "a slow walk with looks to both sides, ±75°"),
     "block": Kind(480, 10, _block, _walking, "a walk round a block, one and a third times"),
     "row": Kind(400, 10, _row, _passing, "a walk past houses that are all alike, 48 m"),

@@ -138,10 +138,12 @@ def tracked_run(folder, maps):
     write_covariances(folder / "covariance.txt", times, P, TRACKED)
     write_tum(folder / "groundtruth.txt", times, truth)
     rows = [
-        f"{i},{times[i]:.9f},{state},{number},9,1.5,18,0.1,,,{fixed}"
+        f"{i},{times[i]:.9f},{state},{number},9,1.5,18,0.1,,,{fixed},"
+        f"{'few agree' if state == 'lost' else ''},0,0,"
         for i, (number, state, fixed, _) in enumerate(told)
     ]
     header = "frame,time,state,map,matches,nis,nis_dof,sigma_position,log_scale,more,unit_fixed"
+    header += ",reason,relocalised,submap,loop"  # the last ones empty, or words with spaces
     (folder / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
     return T[None], P[None], truth[None]
 

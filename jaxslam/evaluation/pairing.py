@@ -170,7 +170,8 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
             f"taken to be {1e3 * time_offset:.1f} ms late, as found" if time_offset else "in time"
         )
         notes.append(f"the estimate is {told}")
-    times, P = log.times[there] - float(time_offset), P[there]
+    stamps, P = log.times[there], P[there]
+    times = stamps - float(time_offset)
     log = log._replace(times=times, poses=log.poses[there])
     true, estimates, more = _truths(logs, log, P)
     if np.isnan(true[:, 0, 0]).all():
@@ -179,7 +180,7 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
     if unused := len(text.times) - len(np.unique(of)):
         left_out["covariances are at no time of the estimate"] = unused, len(text.times)
-    those = evaluated_poses(logs.files.estimate.parent, times, exactly_known(P))
+    those = evaluated_poses(logs.files.estimate.parent, stamps, exactly_known(P))
     for what, others in those.others.items():
         left_out |= _counted(what, others)
     if any(others.any() for others in those.others.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -10,10 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
-from jaxslam.io.text import read_table, text_lines
+from jaxslam.io.text import text_lines
 
 FRAMES = "frames.csv"
 _COLUMNS = ("time", "state", "map", "unit_fixed")
+_ROW = re.compile(r"-?\d+(\.\d*)?,\w+,\d{1,6},[01]")
 _FRAME = "a finite time, a state, the number of a map, and unit_fixed 0 or 1"
 
 
@@ -82,18 +84,16 @@ def read_frames(path: Path) -> FrameLog | None:
     Raises ValueError, naming the line, for what a tracker does not write.
     """
     try:
-        first = next(iter(text_lines(path, comments=True).values()), "")
+        told = text_lines(path)
     except ValueError:  # there is none, or it is no text
         return None
-    if not set(_COLUMNS) <= {title.strip() for title in first.split(",")}:
+    # Reasons are words with spaces, and most cells of the last columns are empty: nobody's table.
+    titles, *rows = (line.split(",") for line in told.values() or [""])
+    if not rows or not set(_COLUMNS) <= set(titles):
         return None
-    table = read_table(path, "log", "frames", _FRAME)
-    time, state, number, fixed = (table.titles.index(name) for name in _COLUMNS)
-    rows = table.rows
-    there = np.isfinite(rows[:, time]) & (rows[:, number] % 1 == 0) & (rows[:, number] >= 0)
-    there &= (rows[:, number] <= 1e6) & np.isin(rows[:, fixed], (0, 1))
-    if not there.all():
-        raise ValueError(f"{table.place(np.argmin(there))}: expected {_FRAME}")
-    words = table.words.get(state, ("",) * len(rows))
-    lost = np.array([word == "lost" for word in words])
-    return FrameLog(rows[:, time], lost, rows[:, number].astype(int), rows[:, fixed] == 1)
+    columns = [titles.index(name) for name in _COLUMNS]
+    for line, row in zip(list(told)[1:], rows, strict=True):
+        if len(row) != len(titles) or not _ROW.fullmatch(",".join(row[i] for i in columns)):
+            raise ValueError(f"{path}, line {line}: expected {_FRAME}")
+    time, state, number, fixed = np.array(rows)[:, columns].T
+    return FrameLog(time.astype(float), state == "lost", number.astype(int), fixed == "1")

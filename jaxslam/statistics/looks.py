@@ -262,8 +262,8 @@ def _enough(least_dof: float, dof: float, level: float) -> int:
         total = runs * least_dof
         error = math.sqrt(2 * total)
         least, most = (shortfall_limit(total, level, above=above) for above in (False, True))
-        high = (total + error) / least + _unseen(dof, dof, runs)
-        return high <= TOLERANCE**2 and most <= TOLERANCE**2 * (total - error)
+        high = TOLERANCE**2 - _unseen(dof, dof, runs)
+        return total + error <= least * high and most <= TOLERANCE**2 * (total - error)
 
     low, high = 0, 1
     while not told(high):

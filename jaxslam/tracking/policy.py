@@ -43,6 +43,8 @@ less likely than `BY_CHANCE`."""
 MOST = 2 / 3
 """The share of the proven landmarks searched that must agree before a frame after such a one is
 believed."""
+JERK = 4.0
+"""σ of the accelerations of a camera that is jerked, in that of others: motions have tails."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]

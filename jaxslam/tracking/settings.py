@@ -34,7 +34,7 @@ class TrackerSettings:
     unit is whatever that prior makes it.
     """
 
-    filter: str = "recommended+drift"
+    filter: str = "recommended+walk3+drift20"
     """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
     `recommended` is the default: it finds by itself how the camera starts, and its claims are true
     most often (docs/sequences.md)."""

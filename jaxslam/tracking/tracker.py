@@ -33,7 +33,7 @@ from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
-from jaxslam.tracking.policy import LEAST_MATCHES, Policy
+from jaxslam.tracking.policy import JERK, LEAST_MATCHES, Policy
 from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -159,6 +159,12 @@ def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> 
         state = replace(state, reversed=state.reversed + 1, seen=None)
         return _lost(state.coasted(predicted), frame, Lost.REVERSED)
     seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
+    if not lost and state.map.place.unit_fixed:
+        jerked = estimator.predict(state.map.state, predicted.dt, JERK)
+        if reason is not None or estimator.likelier(jerked, predicted, seen):
+            found, why, wavers = policy.observed(frame.image, state, jerked, lost=lost)
+            if why is None:
+                predicted, seen, reason, doubtful = jerked, found, None, wavers
     # Of two motions that contradict each other a place that is known says no more: it is one of
     # both.
     elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)

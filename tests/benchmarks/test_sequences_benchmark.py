@@ -26,7 +26,7 @@ def test_every_filter_of_the_numbers_has_a_column():
     results = on_disk()
     columns = len(benchmark.errors_table(results).splitlines()[0].split(" | ")) - 2
     assert columns == len(benchmark.SHORT)
-    assert all(len(filters) == columns for filters in results.values())
+    assert max(map(len, results.values())) == columns
 
 
 def test_a_video_that_was_lost_says_so_beside_its_error():
@@ -39,16 +39,18 @@ def test_a_video_that_was_lost_says_so_beside_its_error():
 def test_the_sentences_on_covariances_are_of_the_numbers_on_disk():
     page = " ".join((FOLDER / "docs/results.md").read_text().split())
     own, world = (
-        [filters[f"{name}/{benchmark.LANDMARKS}"] for filters in on_disk().values()]
+        [
+            filters[f"{name}/{benchmark.LANDMARKS}"]
+            for video, filters in on_disk().items()
+            if video.startswith("synthetic")
+        ]
         for name in (benchmark.ON_VIDEO, "world")
     )
-    means, others = (
-        sorted(r["beyond_scale"]["mean"] for r in x if r["beyond_scale"]) for x in (own, world)
-    )
-    drifts = sorted(r["drift"][1] for r in own if r["beyond_scale"])
+    means, others = (sorted(r["belief"]["nees"] for r in x) for x in (own, world))
+    drifts = sorted(r["belief"]["drift"][1] for r in own)
     assert f"is {means[0]:.2g} to {means[-1]:.2g} of its degrees of freedom" in page
     assert f"`world` has {others[0]:.2g} to {others[-1]:.2g}," in page
     assert f"is {drifts[0]:.2g} to {drifts[-1]:.2g} of its claimed σ" in page
-    (drift, normalised), *_ = (r["drift"] for r in own)
+    drift, normalised = on_disk()["costado"][benchmark.OWN]["belief"]["drift"]
     assert 1 / 3 < normalised < 1 / 2
     assert f"varies by {drift:.1%} (RMS), less than half".replace("%", " %") in page

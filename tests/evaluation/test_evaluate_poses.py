@@ -762,6 +762,8 @@ def test_frames_that_the_tracker_says_nothing_of_the_unit_of_are_left_out(tmp_pa
     assert "21 of 96 poses are of other maps" in told
     assert "5 of 96 poses are of frames that are lost" in told
     assert "9 of 96 poses are from before the unit of their map was fixed" in told
+    late = jaxslam.evaluate_log(tmp_path, align="sim3", time_offset=1 / 30)
+    assert late.logged.sum() == 60  # its frames are found by their own stamps
     (tmp_path / "frames.csv").unlink()
     assert jaxslam.evaluate_log(tmp_path, align="sim3").verdict["nees"] > 10 * found.verdict["nees"]
 

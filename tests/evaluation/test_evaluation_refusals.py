@@ -345,9 +345,9 @@ OF_FOLDERS = [
         r"known to \d+ of its σ only; log it at the stamps of the truth",
     ),
     (a_part, r"only 15 can be compared.* half the lines"),
-    (frames(",1\n", ",yes\n"), r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
+    (frames(",1,,", ",yes,,"), r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
     (frames("9,0.3", "9,nan0.3"), r"frames\.csv, line 11: expected a finite time"),
-    (frames(",1\n", ",0\n"), "every frame with a pose is lost or has no fixed unit"),
+    (frames(",1,,", ",0,,"), "every frame with a pose is lost or has no fixed unit"),
     (frames("\n0,0", "\n0,-9"), r"pose at 0\.000 s; it must list the frames of the trajectory"),
     (frames("tracked,0", "tracked,-1"), "line 2: .* the number of a map"),
 ]

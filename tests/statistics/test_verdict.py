@@ -72,6 +72,12 @@ def test_a_sigma_wrong_by_30_percent_is_not_called_consistent(runs, factor):
         assert words(many).count("consistent") < 9
 
 
+def test_of_next_to_no_degrees_of_freedom_runs_are_counted_too():
+    found = run_verdict(np.full((1, 50), 1e-6), 1, fitted=1 - 1e-6)
+    assert found["word"] == "cannot tell"
+    assert found["enough"] > 1e6
+
+
 def test_with_runs_enough_a_right_filter_is_consistent_and_with_fewer_nobody_can_tell():
     for runs, word in ((100, "consistent"), (10, "cannot tell")):
         found = words(studies(200, runs))

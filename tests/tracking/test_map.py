@@ -237,7 +237,7 @@ class Broken(Estimator):
     def empty(self):
         return "empty"
 
-    def predict(self, state, seconds):
+    def predict(self, state, seconds, livelier=1.0):
         nothing = np.zeros(0)
         view = Prediction(nothing, nothing, nothing, nothing, nothing, nothing)
         return Predicted(np.asarray(seconds), nothing, nothing, nothing, view)

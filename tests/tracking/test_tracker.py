@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("cv2")
 
@@ -27,6 +28,7 @@ from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
 from jaxslam.tracking import estimator as programs
 from jaxslam.tracking import policy as policies
+from jaxslam.tracking import tracker as trackers
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.policy import LEAST_MATCHES, more_than_chance
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
@@ -159,6 +161,35 @@ def test_half_a_picture_that_moves_otherwise_is_not_believed(seed):
     before, meanwhile, tracker = track_a_lorry(seed, lambda _: still)
     assert meanwhile < before
     assert tracker.restarts == 0
+
+
+def turned(source, angles):
+    """The video of a camera that is turned to the right by these angles (rad) beside its motion."""
+    K = source.calibration
+    K = np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1.0]])
+    for frame, angle in zip(source, angles, strict=True):
+        R = cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+        size = frame.image.shape[::-1]
+        image = cv2.warpPerspective(frame.image, K @ R.T @ np.linalg.inv(K), size)
+        yield replace(frame, image=image)
+
+
+@pytest.mark.parametrize("jerk", [1.0, 4.0])
+def test_a_jerk_that_all_matches_tell_of_is_believed(jerk, monkeypatch):
+    """An angular acceleration of nine σ."""
+    monkeypatch.setattr(trackers, "JERK", jerk)
+    source = synthetic_source(frames=18, seed=1)
+    angles = np.zeros(18)
+    angles[-1] = 9 * SMALL.angular_acceleration_sigma * source.times[1] ** 2 / 2
+    tracker = Tracker(source.calibration, SMALL)
+    *_, last = (tracker.track(frame) for frame in turned(source, angles))
+    assert last.lost == (jerk == 1.0)
+    if jerk > 1:
+        assert source.reference is not None
+        turn = Rotation.from_rotvec([0, angles[-1], 0]).as_matrix()
+        true = source.reference.T_wc[-1, :3, :3] @ turn
+        error = Rotation.from_matrix(true.T @ last.T_wc[:3, :3]).magnitude()
+        assert error < 4 * np.sqrt(np.trace(last.covariance[3:, 3:]))
 
 
 @pytest.mark.slow
