@@ -20,7 +20,7 @@ TILES = ((4, 6), (6, 4), (4, 4), (3, 8), (8, 3), (2, 10), (10, 2), (1, 14), (14,
 """Sums that a product keeps in registers, of which there are 32 with vectors of 64 bytes …"""
 TILES_OF_FEW = ((3, 4), (4, 3), (3, 3), (2, 6), (6, 2), (1, 10), (10, 1))
 """… and 16 with shorter ones."""
-PUTS = {None: "'='", "add": "'+'", "min": "'<'", "max": "'>'"}
+PUTS = {None: "'='", "add": "'+'", "mul": "'*'", "min": "'<'", "max": "'>'"}
 """What `put` in the prelude makes of two numbers at one place."""
 VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
 """The letter by which glibc calls its functions of vectors of so many bytes, and what they need."""

@@ -123,7 +123,7 @@ static void take(char *m, const int *made, const int *table, const int *which, i
   }
 }
 
-// made[which[e]] = or += values[e], or the less or the greater of both, by run, unless it is negative.
+// made[which[e]] =, += or *= values[e], or the less or the greater of both, by run, unless it is negative.
 template <char BY>
 static void put(char *m, const int *made, const int *which, const int *values, int count) {
   for (int e = 0; e < count; ++e) {
@@ -132,8 +132,8 @@ static void put(char *m, const int *made, const int *which, const int *values, i
       if (at[l] < 0) continue;
       SCALAR *place = (SCALAR *)(m + made[(long)at[l]]) + l;
       const SCALAR old = *place;
-      if (BY == '=' || BY == '+')
-        *place = BY == '+' ? old + x[l] : x[l];
+      if (BY == '=' || BY == '+' || BY == '*')
+        *place = BY == '+' ? old + x[l] : BY == '*' ? old * x[l] : x[l];
       else if (old == old && !(BY == '<' ? old < x[l] : old > x[l]))
         *place = x[l];
     }

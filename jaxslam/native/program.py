@@ -49,7 +49,7 @@ class Put:
     which: Refs
     values: Refs
     by: str | None
-    """`add`, `min` or `max`."""
+    """`add`, `mul`, `min` or `max`."""
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ class Tracer:
 SUMS = ("reduce_sum", "reduce_prod", "cumsum", "cumprod", "dot_general")
 ARITHMETIC = (
     *("add", "add_any", "sub", "mul", "neg", "abs", "sign", "div", "rem", "pow", "integer_pow"),
-    *("square", "convert_element_type", "scatter-add", *SUMS),
+    *("square", "convert_element_type", "scatter-add", "scatter-mul", *SUMS),
 )
 """What takes integers out of the range of their type."""
 INNER = {
@@ -807,6 +807,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "gather": _gather,
     "scatter": _scatter(None),
     "scatter-add": _scatter("add"),
+    "scatter-mul": _scatter("mul"),
     "scatter-min": _scatter("min"),
     "scatter-max": _scatter("max"),
     "cond": _cond,
