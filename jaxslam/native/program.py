@@ -89,6 +89,10 @@ class Loop:
     written: Refs
     """Row t is what `results` are in turn t."""
     results: Refs
+    count: Refs | None = None
+    """One: so many turns at the most, of each run …"""
+    held: Refs | None = None
+    """… after which this is what stays in `written`."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,9 @@ def read_by(step: Step) -> list[Refs]:
             return [step.given]
         case Check():
             return [step.refs, *([] if step.where is None else [step.where.ravel()])]
-        case Loop() | While():
+        case Loop():
+            return [step.before, *(x for x in (step.count, step.held) if x is not None)]
+        case While():
             return [step.before]
     return []
 
