@@ -128,10 +128,12 @@ class _Writer:
         match step:
             case Take():
                 table, which = (self.tables(self.offset(x)) for x in (step.table, step.which))
-                return f"take(m, {made}, {table}, {which}, {step.made.size});"
+                of = "row_" if step.table.ndim > 1 else ""
+                return f"{of}take(m, {made}, {table}, {which}, {step.made.size});"
             case Put():
                 which, values = (self.tables(self.offset(x)) for x in (step.which, step.values))
-                put = f"put<{PUTS[step.by]}>(m, {made}, {which}, {values}, {step.values.size});"
+                of = "row_put" if step.table.ndim > 1 else f"put<{PUTS[step.by]}>"
+                put = f"{of}(m, {made}, {which}, {values}, {step.values.size});"
                 return f"{self.copied(step.made, step.table)} {put}"
             case Sort():
                 sizes = ", ".join(map(str, step.made.shape))

@@ -313,6 +313,8 @@ class _Places:
         )
         self.elsewhere = np.zeros(self.plan.live.size, bool)
         """What is not to be written over anything."""
+        self.ended, self.within = (np.full_like(self.last, -1) for _ in range(2))
+        """When the loop that carries a number ends, and when it is read the last time there."""
         self.read_last: np.ndarray | None = None
         """When a number is read the last time, once that is known."""
 
@@ -366,7 +368,9 @@ class _Places:
         made, old = made.ravel(), old.ravel()
         elements = self.plan.program.elements
         fits = self.plan.live[made] & (elements.code[old] != CONSTANT) & ~self.elsewhere[made]
-        fits &= (self.read_last[old] <= self.clock) & ~np.isin(old, apart)
+        carried = self.clock <= self.ended[old]
+        last = np.where(carried, self.within[old], self.read_last[old])
+        fits &= (last <= self.clock) & ~np.isin(old, apart)
         once, count = np.unique(old, return_counts=True)
         fits &= np.isin(old, once[count == 1]) & (self.block_of[made] < 0)
         made, old = made[fits], old[fits]
@@ -446,6 +450,8 @@ class _Places:
         self.clock = end
         for refs in read_in_turn(step):
             self.read(self.used(refs), within, held=counted and refs is step.rows)
+        if self.read_last is None:
+            self.ended[step.carry], self.within[step.carry] = end, self.last[step.carry]
         for refs in written_by(step):
             self.read(self.used(refs), within, held=True)
 

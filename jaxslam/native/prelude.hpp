@@ -140,6 +140,33 @@ static void put(char *m, const int *made, const int *which, const int *values, i
   }
 }
 
+// made[e] = table[which[0]][e], by run.
+static void row_take(char *m, const int *made, const int *table, const int *which, int count) {
+  const V at = AT(which[0]);
+  const int *rows[W];
+  for (int l = 0; l < W; ++l) rows[l] = table + (long)at[l] * count;
+  for (int e = 0; e < count; ++e) {
+    V x;
+    for (int l = 0; l < W; ++l) x[l] = ((const SCALAR *)(m + rows[l][e]))[l];
+    AT(made[e]) = x;
+  }
+}
+
+// made[which[0]][e] = values[e], by run, unless it is negative.
+static void row_put(char *m, const int *made, const int *which, const int *values, int count) {
+  const V at = AT(which[0]);
+  const int *rows[W];
+  int lanes[W], some = 0;
+  for (int l = 0; l < W; ++l) {
+    if (at[l] < 0) continue;
+    rows[some] = made + (long)at[l] * count;
+    lanes[some++] = l;
+  }
+  for (int e = 0; e < count; ++e)
+    for (int k = 0; k < some; ++k)
+      ((SCALAR *)(m + rows[k][e]))[lanes[k]] = ((const SCALAR *)(m + values[e]))[lanes[k]];
+}
+
 // NaN where one of these is not finite.
 static inline V doubts(char *m, const int *which, int count) {
   V sum = ZERO;

@@ -32,7 +32,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Take:
-    """`made[e] = table[which[e]]`, in every run another."""
+    """`made[e] = table[which[e]]`, in every run another; or, of a table in rows, one row."""
 
     made: Refs
     table: Refs
@@ -42,7 +42,7 @@ class Take:
 @dataclass(frozen=True)
 class Put:
     """A copy of `table` with `values[e]` at `which[e]`, or what an operation makes of both there;
-    dropped where −1."""
+    dropped where −1. Of a table in rows one row is put."""
 
     made: Refs
     table: Refs

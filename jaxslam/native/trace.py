@@ -490,6 +490,10 @@ def _dynamic_slice(tracer, equation, arguments):
         if (row := rows.read(x, starts, sizes)) is not None:
             return row
     starts = [_clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, sizes, strict=True)]
+    if _is_row(tracer, x, starts, sizes):
+        made = tracer.elements.variables(sizes)
+        tracer.steps.append(Take(made.ravel(), x.reshape(len(x), -1), starts[0].ravel()))
+        return made
     return _taken(tracer, x, _places(tracer, starts, sizes))
 
 
@@ -501,7 +505,24 @@ def _dynamic_update_slice(tracer, equation, arguments):
     starts = [
         _clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, new.shape, strict=True)
     ]
+    if _is_row(tracer, x, starts, new.shape):
+        made, which = tracer.elements.variables((len(x), x[0].size)), _held(tracer, starts[0])
+        tracer.steps.append(Put(made, x.reshape(made.shape), which.ravel(), new.ravel(), None))
+        return made.reshape(x.shape)
     return _written(tracer, x, _places(tracer, starts, new.shape), new, None)
+
+
+def _is_row(tracer, x, starts, sizes):
+    """Whether a window is a row of several, and which is not known."""
+    several = x.ndim > 1 and len(x) > 1 and tuple(sizes) == (1, *x.shape[1:])
+    return several and tracer.elements.known(starts[0]) is None
+
+
+def _held(tracer, which):
+    """Places where something is put: what a run that has left a loop holds stays as it is."""
+    if tracer.going is None:
+        return which
+    return tracer.apply("select", tracer.going, tracer.constant(-1.0), which)
 
 
 def _places(tracer, starts, sizes):
@@ -546,9 +567,8 @@ def _written(tracer, x, places, values, by, inside=None):
     which = np.broadcast_to(which, values.shape)
     if inside is not None:
         which = tracer.apply("select", inside, tracer.constant(-1.0), which)
-    elif tracer.elements.known(which) is None and tracer.going is not None:
-        # What a run that has left a loop holds stays where it is.
-        which = tracer.apply("select", tracer.going, tracer.constant(-1.0), which)
+    if tracer.elements.known(which) is None:
+        which = _held(tracer, which)
     known = tracer.elements.known(which)
     if known is not None:
         return _moved(tracer, x, known.ravel().astype(int), values.ravel(), by)
