@@ -117,14 +117,14 @@ def at_places(
 
     @custom_vmap
     def work(values, sources, places, wanted, shared):
-        first = jnp.argsort(~wanted) if wanted.size > 1 else jnp.zeros(1, int)
-
         def one(k, values):
-            place = tuple(places[first[k]])
+            place = tuple(_row(places, k))
             rows = jax.tree.map(lambda x: jnp.stack([_row(x, i) for i in place]), (values, sources))
-            return jax.tree.map(partial(_with_rows, place), values, call(rows, shared))
+            after = jax.lax.cond(_row(wanted, k), call, lambda rows, _: rows[0], rows, shared)
+            return jax.tree.map(partial(_with_rows, place), values, after)
 
-        return jax.lax.fori_loop(0, jnp.sum(wanted), one, values)
+        last = jnp.max(jnp.where(wanted, jnp.arange(1, wanted.size + 1), 0))
+        return jax.lax.fori_loop(0, last, one, values)
 
     @work.def_vmap
     def in_batch(size, batched, *data):

@@ -20,7 +20,7 @@ TILES = ((4, 6), (6, 4), (4, 4), (3, 8), (8, 3), (2, 10), (10, 2), (1, 14), (14,
 """Sums that a product keeps in registers, of which there are 32 with vectors of 64 bytes …"""
 TILES_OF_FEW = ((3, 4), (4, 3), (3, 3), (2, 6), (6, 2), (1, 10), (10, 1))
 """… and 16 with shorter ones."""
-PUTS = {None: "'='", "add": "'+'", "min": "'<'", "max": "'>'"}
+PUTS = {None: "'='", "add": "'+'", "mul": "'*'", "min": "'<'", "max": "'>'"}
 """What `put` in the prelude makes of two numbers at one place."""
 VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
 """The letter by which glibc calls its functions of vectors of so many bytes, and what they need."""
@@ -128,10 +128,12 @@ class _Writer:
         match step:
             case Take():
                 table, which = (self.tables(self.offset(x)) for x in (step.table, step.which))
-                return f"take(m, {made}, {table}, {which}, {step.made.size});"
+                of = "row_" if step.table.ndim > 1 else ""
+                return f"{of}take(m, {made}, {table}, {which}, {step.made.size});"
             case Put():
                 which, values = (self.tables(self.offset(x)) for x in (step.which, step.values))
-                put = f"put<{PUTS[step.by]}>(m, {made}, {which}, {values}, {step.values.size});"
+                of = "row_put" if step.table.ndim > 1 else f"put<{PUTS[step.by]}>"
+                put = f"{of}(m, {made}, {which}, {values}, {step.values.size});"
                 return f"{self.copied(step.made, step.table)} {put}"
             case Sort():
                 sizes = ", ".join(map(str, step.made.shape))
@@ -149,7 +151,12 @@ class _Writer:
 
     def copied(self, to: Refs, source: Refs) -> str:
         """Numbers in memory at another place."""
-        return self.loop_over([self.offset(source).ravel()], self.offset(to).ravel(), "{0}")
+        to, source = (self.offset(x).ravel() for x in (to, source))
+        return self.loop_over([source[to != source]], to[to != source], "{0}")
+
+    def moved(self, step: Loop | While) -> np.ndarray:
+        """Which numbers of a carry are elsewhere after a turn."""
+        return self.plan.slot[step.after] != self.plan.slot[step.carry]
 
     def apply(self, step: Apply) -> str:
         plan = self.plan
@@ -297,13 +304,20 @@ class _Writer:
         """A loop in C++."""
         live = self.plan.live
         read, told = live[step.read], live[step.written].any(0)
-        body = self.function(step.steps)
-        moved = step.after != step.carry
+        if not step.carry.size and not told.any():
+            return ""
+        body, moved = self.function(step.steps), self.moved(step)
         begin = self.copied(step.carry, step.before)
+        stop = ""
+        if step.count is not None and step.held is not None:
+            begin += self.copied(step.written[:, told], step.held[:, told])
+            count = int(self.offset(step.count)[0])
+            stop = f"if (!l_any((C(t) < AT({count})) ? ONE : ZERO)) break;"
+            self.local.clear()
         turn = f"{step.length - 1} - t" if step.reverse else "t"
         lines = [
             begin,
-            f"for (long t = 0; t < {step.length}; ++t) {{",
+            f"for (long t = 0; t < {step.length}; ++t) {{ {stop}",
             f"const long turn = {turn};",
         ]
         lines.append(self.row(step.rows[:, read], step.read[read], True))
@@ -334,7 +348,7 @@ class _Writer:
     def repeat(self, step: While) -> str:
         """A loop that every run leaves when it is done."""
         condition, body = self.function(step.condition), self.function(step.steps)
-        moved = step.after != step.carry
+        moved = self.moved(step)
         places = [np.repeat(self.offset(step.going), moved.sum())]
         places += [self.offset(x[moved]) for x in (step.carry, step.after)]
         select = self.loop_over(places, places[1], "(({0} != ZERO) ? {2} : {1})")

@@ -15,6 +15,7 @@ from jaxslam.native.program import (
     ElementProgram,
     Loop,
     Product,
+    Put,
     Step,
     While,
     read_by,
@@ -129,18 +130,24 @@ def _near(steps: list[Step], size: int) -> list[Step]:
     if not checks:
         return steps
     (check,) = checks
-    result = []
-    left = np.zeros(size, bool)
-    left[check.refs] = True
-    for step in steps:
-        result.append(step)
-        if isinstance(step, Apply | Product):
-            made = step.made[step.made >= 0]
-            here = made[left[made]]
-            if here.size:
-                result.append(replace(check, refs=np.sort(here)))
-                left[here] = False
-    return [*result, replace(check, refs=np.flatnonzero(left))] if left.any() else result
+    written = [np.concatenate([np.zeros(0, int), *(x.ravel() for x in _made(x))]) for x in steps]
+    of = np.full(size, -1)
+    for number, made in enumerate(written):
+        of[made] = number
+    # What is from elsewhere is checked first, before it is written over.
+    known = -1 if check.where is None else int(of[check.where].max())
+    of = np.maximum(of[check.refs], known)
+    parts = [check.refs[of == number] for number in range(-1, len(steps))]
+    at = [[replace(check, refs=refs)] if refs.size else [] for refs in parts]
+    result = at[0]
+    for step, checked in zip(steps, at[1:], strict=True):
+        result += [step, *checked]
+    return result
+
+
+def _made(step: Step) -> list[Refs]:
+    """What a step writes."""
+    return [step.made] if isinstance(step, Apply) else written_by(step)
 
 
 def _near_within(step: Step, size: int) -> Step:
@@ -169,9 +176,15 @@ def _live(program: ElementProgram, checks: bool = True) -> tuple[np.ndarray, np.
                 case Apply():
                     live[arguments[step.made[live[step.made]]]] = True
                 case Loop():
+                    told = live[step.written].any(0)
+                    if not step.carry.size and not told.any():
+                        continue
                     need(step.carry)
                     need(step.after)
-                    need(step.results[live[step.written].any(0)])
+                    need(step.results[told])
+                    if step.count is not None and step.held is not None:
+                        need(step.count)
+                        need(step.held[:, told])
                     visit(step.steps)
                     need(step.before)
                     need(step.rows[:, live[step.read]])
@@ -284,17 +297,53 @@ class _Block:
 
 @dataclass
 class _Places:
-    """Blocks of memory, from the step that writes to the last that reads."""
+    """Blocks of memory, from the step that writes to the last that reads.
+
+    What is written last, over what nothing reads any more, stays where that was: a row of a table,
+    or a number that a loop carries.
+    """
 
     plan: Plan
     blocks: list[_Block] = field(default_factory=list)
     clock: int = 0
 
     def __post_init__(self) -> None:
-        self.block_of = np.full(self.plan.live.size, -1, np.int64)
+        self.block_of, self.over, self.born, self.last = (
+            np.full(self.plan.live.size, -1, np.int64) for _ in range(4)
+        )
+        self.elsewhere = np.zeros(self.plan.live.size, bool)
+        """What is not to be written over anything."""
+        self.ended, self.within = (np.full_like(self.last, -1) for _ in range(2))
+        """When the loop that carries a number ends, and when it is read the last time there."""
+        self.read_last: np.ndarray | None = None
+        """When a number is read the last time, once that is known."""
 
     def assign(self) -> None:
         """Slots of all that is in memory."""
+        self.passed()
+        while True:
+            self.read_last = self.last
+            self.blocks, self.clock = [], 0
+            for array in (self.block_of, self.over, self.born):
+                array[:] = -1
+            self.last = np.full_like(self.last, -1)
+            self.passed()
+            self.fit()
+            before = self.elsewhere.sum()
+            each(self.plan.program.steps, self.swapped)
+            if self.elsewhere.sum() == before:
+                return
+
+    def swapped(self, step: Step) -> None:
+        """Note what is copied to where something else is carried, but stands where another is."""
+        if isinstance(step, Loop | While):
+            live = self.plan.live[step.carry]
+            to, source = (self.plan.slot[x[live]] for x in (step.carry, step.after))
+            wrong = (to != source) & np.isin(source, to)
+            self.elsewhere[step.after[live][wrong]] = True
+
+    def passed(self) -> None:
+        """The blocks of the whole program, in its order."""
         program, elements = self.plan.program, self.plan.program.elements
         kept = self.plan.live & (elements.code == CONSTANT)
         self.write(np.flatnonzero(kept), ())
@@ -304,23 +353,45 @@ class _Places:
         self.clock += 1
         for refs in [np.flatnonzero(kept), *program.outputs]:
             self.read(refs, ())
-        self.fit()
 
     def write(self, refs: Refs, around) -> None:
         """A block for these numbers, from now on."""
         new = refs[self.block_of[refs] < 0]
         if new.size:
-            self.block_of[new] = len(self.blocks)
+            self.block_of[new], self.born[new] = len(self.blocks), self.clock
             self.blocks.append(_Block(new, self.clock, self.clock, enclosing=around))
 
-    def read(self, refs: Refs, around) -> None:
-        """They are used now, or in every turn of the loops around that began after them."""
+    def write_over(self, made: Refs, old: Refs, apart: Refs) -> None:
+        """Write numbers where others were, if these are read no more and are not `apart`."""
+        if self.read_last is None:
+            return
+        made, old = made.ravel(), old.ravel()
+        elements = self.plan.program.elements
+        fits = self.plan.live[made] & (elements.code[old] != CONSTANT) & ~self.elsewhere[made]
+        carried = self.clock <= self.ended[old]
+        last = np.where(carried, self.within[old], self.read_last[old])
+        fits &= (last <= self.clock) & ~np.isin(old, apart)
+        once, count = np.unique(old, return_counts=True)
+        fits &= np.isin(old, once[count == 1]) & (self.block_of[made] < 0)
+        made, old = made[fits], old[fits]
+        self.over[made], self.block_of[made] = old, self.block_of[old]
+        self.born[made] = self.clock
+
+    def read(self, refs: Refs, around, held: bool = False) -> None:
+        """They are used now, or in every turn of the loops around that began after them; or they
+        are only held."""
         for number in np.unique(self.block_of[refs]).tolist():
             if number < 0:
                 continue
             block = self.blocks[number]
             ends = [end for begin, end in around if block.start < begin]
             block.end = max(block.end, self.clock, *ends[:1])
+        if held:
+            return
+        when = np.full(refs.shape, self.clock)
+        for begin, end in reversed(around):
+            when = np.where(self.born[refs] < begin, end, when)
+        np.maximum.at(self.last, refs, when)
 
     def visit(self, steps, around) -> None:
         for step in steps:
@@ -330,11 +401,29 @@ class _Places:
                 continue
             for refs in read_by(step):
                 self.read(self.used(refs), around)
+            self.in_place(step, around)
             for refs in written_by(step):
                 refs = np.asarray(refs).ravel()
                 self.write(refs[self.plan.live[refs]], around)
             if inside(step):
                 self.loop(step, around)
+
+    def in_place(self, step: Step, around) -> None:
+        """What a step writes over what it has read."""
+        none = np.zeros(0, np.int64)
+        match step:
+            case Put():
+                apart = np.concatenate([step.which.ravel(), step.values.ravel()])
+                self.write_over(step.made, step.table, apart)
+            case Loop() | While():
+                self.write_over(step.carry, step.before, none)
+                if isinstance(step, Loop) and step.held is not None:
+                    self.read(self.used(step.rows), around)
+                    row = np.full(self.plan.live.size, -1)
+                    row[step.held] = np.arange(step.length)[:, None]
+                    of = row[step.rows]
+                    other = (of >= 0) & (of != np.arange(step.length)[:, None])
+                    self.write_over(step.written, step.held, step.rows[other])
 
     def used(self, refs):
         return refs[self.plan.live[refs]]
@@ -352,15 +441,24 @@ class _Places:
         self.clock += 1
         end = begin + 2 + sum(_duration(inner) for inner in inside(step))
         within = (*around, (begin + 1, end))
+        counted = isinstance(step, Loop) and step.held is not None
+        own = (step.carry, step.read) if isinstance(step, Loop) else (step.carry,)
+        for refs in own:
+            self.born[refs] = self.clock
         for inner in inside(step):
             self.visit(inner, within)
         self.clock = end
-        for refs in [*read_in_turn(step), *written_by(step)]:
-            self.read(self.used(refs), within)
+        for refs in read_in_turn(step):
+            self.read(self.used(refs), within, held=counted and refs is step.rows)
+        if self.read_last is None:
+            self.ended[step.carry], self.within[step.carry] = end, self.last[step.carry]
+        for refs in written_by(step):
+            self.read(self.used(refs), within, held=True)
 
     def fit(self) -> None:
         """The first gap that is free for as long."""
         taken: list[tuple[int, int, int]] = []
+        self.plan.slots = 0
         for block in self.blocks:
             taken = [x for x in taken if x[2] >= block.start]
             block.first, size = 0, len(block.refs)
@@ -371,6 +469,11 @@ class _Places:
             taken.append((block.first, block.first + size, block.end))
             self.plan.slot[block.refs] = block.first + np.arange(size)
             self.plan.slots = max(self.plan.slots, block.first + size)
+        there = np.flatnonzero(self.over >= 0)
+        root = self.over[there]
+        while np.any(again := self.over[root] >= 0):
+            root[again] = self.over[root[again]]
+        self.plan.slot[there] = self.plan.slot[root]
 
 
 def _duration(steps) -> int:

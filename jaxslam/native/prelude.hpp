@@ -123,7 +123,7 @@ static void take(char *m, const int *made, const int *table, const int *which, i
   }
 }
 
-// made[which[e]] = or += values[e], or the less or the greater of both, by run, unless it is negative.
+// made[which[e]] =, += or *= values[e], or the less or the greater of both, by run, unless it is negative.
 template <char BY>
 static void put(char *m, const int *made, const int *which, const int *values, int count) {
   for (int e = 0; e < count; ++e) {
@@ -132,12 +132,39 @@ static void put(char *m, const int *made, const int *which, const int *values, i
       if (at[l] < 0) continue;
       SCALAR *place = (SCALAR *)(m + made[(long)at[l]]) + l;
       const SCALAR old = *place;
-      if (BY == '=' || BY == '+')
-        *place = BY == '+' ? old + x[l] : x[l];
+      if (BY == '=' || BY == '+' || BY == '*')
+        *place = BY == '+' ? old + x[l] : BY == '*' ? old * x[l] : x[l];
       else if (old == old && !(BY == '<' ? old < x[l] : old > x[l]))
         *place = x[l];
     }
   }
+}
+
+// made[e] = table[which[0]][e], by run.
+static void row_take(char *m, const int *made, const int *table, const int *which, int count) {
+  const V at = AT(which[0]);
+  const int *rows[W];
+  for (int l = 0; l < W; ++l) rows[l] = table + (long)at[l] * count;
+  for (int e = 0; e < count; ++e) {
+    V x;
+    for (int l = 0; l < W; ++l) x[l] = ((const SCALAR *)(m + rows[l][e]))[l];
+    AT(made[e]) = x;
+  }
+}
+
+// made[which[0]][e] = values[e], by run, unless it is negative.
+static void row_put(char *m, const int *made, const int *which, const int *values, int count) {
+  const V at = AT(which[0]);
+  const int *rows[W];
+  int lanes[W], some = 0;
+  for (int l = 0; l < W; ++l) {
+    if (at[l] < 0) continue;
+    rows[some] = made + (long)at[l] * count;
+    lanes[some++] = l;
+  }
+  for (int e = 0; e < count; ++e)
+    for (int k = 0; k < some; ++k)
+      ((SCALAR *)(m + rows[k][e]))[lanes[k]] = ((const SCALAR *)(m + values[e]))[lanes[k]];
 }
 
 // NaN where one of these is not finite.

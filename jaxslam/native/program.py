@@ -32,7 +32,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Take:
-    """`made[e] = table[which[e]]`, in every run another."""
+    """`made[e] = table[which[e]]`, in every run another; or, of a table in rows, one row."""
 
     made: Refs
     table: Refs
@@ -42,14 +42,14 @@ class Take:
 @dataclass(frozen=True)
 class Put:
     """A copy of `table` with `values[e]` at `which[e]`, or what an operation makes of both there;
-    dropped where −1."""
+    dropped where −1. Of a table in rows one row is put."""
 
     made: Refs
     table: Refs
     which: Refs
     values: Refs
     by: str | None
-    """`add`, `min` or `max`."""
+    """`add`, `mul`, `min` or `max`."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,10 @@ class Loop:
     written: Refs
     """Row t is what `results` are in turn t."""
     results: Refs
+    count: Refs | None = None
+    """One: so many turns at the most, of each run …"""
+    held: Refs | None = None
+    """… after which this is what stays in `written`."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,9 @@ def read_by(step: Step) -> list[Refs]:
             return [step.given]
         case Check():
             return [step.refs, *([] if step.where is None else [step.where.ravel()])]
-        case Loop() | While():
+        case Loop():
+            return [step.before, *(x for x in (step.count, step.held) if x is not None)]
+        case While():
             return [step.before]
     return []
 

@@ -28,6 +28,7 @@ from jaxslam.native.program import (
     Take,
     While,
 )
+from jaxslam.native.rows import Rows
 
 UNROLLED = 3000
 """Operations up to which all turns of a loop are written out: their indices are then known."""
@@ -76,6 +77,8 @@ class Tracer:
         """Up to here, integers are numbers."""
         self.going: Refs | None = None
         """Where the loops around are still going on."""
+        self.rows: list[Rows] = []
+        """Those that the loops around read and write."""
         self.whole = False
         """Whether sums are of integers."""
 
@@ -199,7 +202,7 @@ class Tracer:
 SUMS = ("reduce_sum", "reduce_prod", "cumsum", "cumprod", "dot_general")
 ARITHMETIC = (
     *("add", "add_any", "sub", "mul", "neg", "abs", "sign", "div", "rem", "pow", "integer_pow"),
-    *("square", "convert_element_type", "scatter-add", *SUMS),
+    *("square", "convert_element_type", "scatter-add", "scatter-mul", *SUMS),
 )
 """What takes integers out of the range of their type."""
 INNER = {
@@ -483,16 +486,43 @@ def _product(tracer, a, b, terms):
 def _dynamic_slice(tracer, equation, arguments):
     x, *starts = arguments
     sizes = equation.params["slice_sizes"]
+    for rows in tracer.rows[-1:]:
+        if (row := rows.read(x, starts, sizes)) is not None:
+            return row
     starts = [_clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, sizes, strict=True)]
+    if _is_row(tracer, x, starts, sizes):
+        made = tracer.elements.variables(sizes)
+        tracer.steps.append(Take(made.ravel(), x.reshape(len(x), -1), starts[0].ravel()))
+        return made
     return _taken(tracer, x, _places(tracer, starts, sizes))
 
 
 def _dynamic_update_slice(tracer, equation, arguments):
     x, new, *starts = arguments
+    for rows in tracer.rows[-1:]:
+        if (made := rows.write(x, new, starts)) is not None:
+            return made
     starts = [
         _clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, new.shape, strict=True)
     ]
+    if _is_row(tracer, x, starts, new.shape):
+        made, which = tracer.elements.variables((len(x), x[0].size)), _held(tracer, starts[0])
+        tracer.steps.append(Put(made, x.reshape(made.shape), which.ravel(), new.ravel(), None))
+        return made.reshape(x.shape)
     return _written(tracer, x, _places(tracer, starts, new.shape), new, None)
+
+
+def _is_row(tracer, x, starts, sizes):
+    """Whether a window is a row of several, and which is not known."""
+    several = x.ndim > 1 and len(x) > 1 and tuple(sizes) == (1, *x.shape[1:])
+    return several and tracer.elements.known(starts[0]) is None
+
+
+def _held(tracer, which):
+    """Places where something is put: what a run that has left a loop holds stays as it is."""
+    if tracer.going is None:
+        return which
+    return tracer.apply("select", tracer.going, tracer.constant(-1.0), which)
 
 
 def _places(tracer, starts, sizes):
@@ -537,6 +567,8 @@ def _written(tracer, x, places, values, by, inside=None):
     which = np.broadcast_to(which, values.shape)
     if inside is not None:
         which = tracer.apply("select", inside, tracer.constant(-1.0), which)
+    if tracer.elements.known(which) is None:
+        which = _held(tracer, which)
     known = tracer.elements.known(which)
     if known is not None:
         return _moved(tracer, x, known.ravel().astype(int), values.ravel(), by)
@@ -761,8 +793,79 @@ def _copies(tracer, refs):
     return tracer.apply("copy", refs)
 
 
+def _counted(tracer, p, arguments):
+    """The results of a loop over rows, as many as every run has; None for any other loop."""
+    first, places = p["body_nconsts"], _turn_and_limit(p)
+    if places is None or p["cond_nconsts"]:
+        return None
+    of_body, start = arguments[:first], arguments[first:]
+    number, limit = (start[place] for place in places)
+    arrays = [k for k in range(len(start)) if k not in places]
+    known = tracer.elements.known(number)
+    if known is None or known != 0 or not arrays or not all(start[k].ndim for k in arrays):
+        return None
+    length = len(start[arrays[0]])
+    with tracer.aside() as steps:
+        rows, around = Rows(tracer.elements, length), tracer.going
+        going = tracer.apply("lt", rows.turn, limit)
+        tracer.going = going if around is None else tracer.apply("and", going, around)
+        tracer.rows.append(rows)
+        instead = {k: rows.stand_in(start[k]) for k in arrays}
+        carry = [instead.get(k, limit) for k in range(len(start))]
+        carry[places[0]] = rows.turn
+        results = tracer.closed(p["body_jaxpr"], [*of_body, *carry])
+        both = [rows.after(instead[k], results[k], steps) for k in arrays]
+        tracer.rows.pop()
+        if None not in both:
+            old, new = (_joined(x) for x in zip(*both, strict=True))
+            new = tracer.apply("select", tracer.going, old, new)
+    if None in both:
+        return None
+    held = np.concatenate([start[k].reshape(length, -1) for k in arrays], axis=1)
+    changed = new != old
+    told, place = np.unique(
+        np.concatenate([new[None], held])[:, changed], axis=1, return_inverse=True
+    )
+    written = tracer.elements.variables(told[1:].shape)
+    after, none = held.copy(), np.zeros(0, np.int32)
+    after[:, changed] = written[:, place.ravel()]
+    tracer.steps.append(
+        Loop(
+            steps, length, False, none, none, none, _joined(rows.variables),
+            np.concatenate(rows.tables, axis=1), written, told[0], limit.ravel(), told[1:],
+        )
+    )  # fmt: skip
+    sizes = np.cumsum([start[k][0].size for k in arrays])[:-1]
+    parts = dict(zip(arrays, np.split(after, sizes, axis=1), strict=True))
+    return [parts[k].reshape(x.shape) if k in parts else limit for k, x in enumerate(start)]
+
+
+def _turn_and_limit(p):
+    """The places of the number of a turn, and of where it ends, in what a loop carries; or None."""
+    condition, body = (p[name].jaxpr for name in ("cond_jaxpr", "body_jaxpr"))
+    carry = body.invars[p["body_nconsts"] :]
+    compared = [x for one in condition.eqns for x in one.invars]
+    if [x.primitive.name for x in condition.eqns] != ["lt"] or not all(
+        x in condition.invars for x in compared if not isinstance(x, Literal)
+    ):
+        return None
+    if any(isinstance(x, Literal) for x in compared):
+        return None
+    turn, limit = map(condition.invars.index, compared)
+    for one in body.eqns:
+        if one.outvars[0] is body.outvars[turn] and body.outvars[limit] is carry[limit]:
+            by_one = one.primitive.name == "add" and one.invars[0] is carry[turn]
+            by_one = by_one and isinstance(one.invars[1], Literal) and one.invars[1].val == 1
+            return (turn, limit) if by_one else None
+    return None
+
+
 def _while(tracer, equation, arguments):
-    p = equation.params
+    results = _counted(tracer, equation.params, arguments)
+    return _repeated_while(tracer, equation.params, arguments) if results is None else results
+
+
+def _repeated_while(tracer, p, arguments):
     first, last = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
     of_condition, of_body, start = arguments[:first], arguments[first:last], arguments[last:]
     before = _joined(start)
@@ -807,6 +910,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "gather": _gather,
     "scatter": _scatter(None),
     "scatter-add": _scatter("add"),
+    "scatter-mul": _scatter("mul"),
     "scatter-min": _scatter("min"),
     "scatter-max": _scatter("max"),
     "cond": _cond,
