@@ -365,7 +365,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
             f"{joint}, not {P.shape}"
         )
-    joints, P = (P, P) if P.shape == joint else (None, without_unknown(P))
+    joints, P = (P, P) if P.shape == joint else (None, without_unknown(P, marked=False))
     if joints is not None:
         blocks = joints.reshape(runs, steps, t, steps, t)
         P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
@@ -384,12 +384,15 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
 
 
-def without_unknown(P: Float[np.ndarray, "runs steps t t"]) -> Float[np.ndarray, "runs steps t t"]:
+def without_unknown(
+    P: Float[np.ndarray, "runs steps t t"], *, marked: bool = True
+) -> Float[np.ndarray, "runs steps t t"]:
     """The covariances, with a variance of `UNKNOWN`, and none with others, on the axes where that
-    of every pose is −1 or larger: what programs write of what they do not estimate."""
+    of every pose is that or larger: what programs write of what they do not estimate. In files it
+    may be `marked` by −1."""
     variance = np.diagonal(P, axis1=2, axis2=3)
     there = ~np.isnan(variance)
-    unknown = (((variance == -1) | (variance >= UNKNOWN)) | ~there).all(axis=(0, 1))
+    unknown = ((marked & (variance == -1)) | (variance >= UNKNOWN) | ~there).all(axis=(0, 1))
     if not unknown.any() or unknown.all():
         return P
     P, axes = P.copy(), np.flatnonzero(unknown)

@@ -104,8 +104,9 @@ def test_axes_of_unknown_variance_have_no_degree_of_freedom(value, tmp_path):
     found = evaluate_log(tmp_path)
     assert found.names == ("x", "y", "rz")
     np.testing.assert_allclose(found.nees, nees, rtol=1e-4)
-    of_arrays = evaluate_poses(T, P[None], truth, Convention("split"))
-    np.testing.assert_allclose(of_arrays.nees, nees, rtol=1e-4)
+    if value > 0:  # in arrays −1 is a mistake
+        of_arrays = evaluate_poses(T, P[None], truth, Convention("split"))
+        np.testing.assert_allclose(of_arrays.nees, nees, rtol=1e-4)
     rows[7, 12] = 1.0
     np.savetxt(tmp_path / "covariance.txt", rows, header="error=split axes=world")
     if np.isinf(value):
