@@ -40,9 +40,10 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
 
-SAME, NEARLY = 0.5, 0.1
-"""RMS of the difference of two pictures that are one: grey levels, and the share of what a picture
-changed before. A camera's own noise is more; what a film's compression leaves of it is less."""
+SAME, NEARLY, MOST_APART = 0.5, 0.1, 2.0
+"""RMS of the difference of two pictures that are one, grey levels: in any case, as a share of what
+a picture changed before, and at the most. A camera's own noise is more; what a film's compression
+leaves of it is less."""
 MOST_REPEATS = 3
 """Pictures in a row that are taken for one which a film has several times."""
 Stepped = tuple[TrackerState, Tracked]
@@ -81,7 +82,7 @@ def step(
         )
     waited = 0.0 if state.time is None else frame.time - state.time + state.waiting
     apart, known = _apart(state.image, frame.image), state.landmarks and not state.unmeasured
-    if known and apart <= max(SAME, NEARLY * state.apart):
+    if known and apart <= max(SAME, min(NEARLY * state.apart, MOST_APART)):
         # The camera is where this picture was taken. What comes after few such pictures has their
         # time too; after many the camera, or the picture, stood still.
         waiting = waited if state.repeats < MOST_REPEATS else 0.0

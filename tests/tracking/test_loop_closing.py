@@ -213,7 +213,7 @@ def small(i, size):
 @pytest.mark.slow
 def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
     *_, source, path = walk
-    frames = list(source)[-11:-60:-1]
+    frames = list(source)[-12:-60:-1]
     for most in (maps.MOST, None):
         again = Tracker.load(path)
         before = len(again.map.submaps)

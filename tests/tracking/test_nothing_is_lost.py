@@ -235,6 +235,16 @@ def test_a_camera_that_stands_still_goes_on_from_there_at_once(once):
     assert found.status.count("matched") > 8
 
 
+def test_after_a_flash_a_small_motion_is_no_repeated_picture(once):
+    """A tenth of what changed between darkness and a picture is more than a slow camera changes."""
+    source, _ = once
+    image = next(iter(source)).image
+    tracker = Tracker(source.calibration, SETTINGS)
+    for k in range(4):
+        noisy = add_noise(image, np.random.default_rng(k)) * (k != 1)
+        assert not tracker.step(noisy.astype(np.uint8), k / 30).repeated
+
+
 def test_noise_alone_makes_another_picture(once):
     source, _ = once
     image = next(iter(source)).image
