@@ -25,10 +25,12 @@ class TrackOptions:
     topic: str | None = None
     """Image topic of a bag. Default: its only image topic."""
     calibration: Path | None = None
-    """Camera calibration, a JSON file with model, width, height, fx, fy, cx, cy and distortion (in
-    OpenCV's order)."""
+    """Camera calibration, a JSON file with model (pinhole, rational or fisheye), width, height, fx,
+    fy, cx, cy and distortion (in OpenCV's order), or a file of OpenCV, ROS, Kalibr, EuRoC, TUM-VI,
+    ORB-SLAM or COLMAP."""
     fov: float | None = None
-    """Horizontal field of view in degrees, in place of a calibration; the lens is then estimated.
+    """Horizontal field of view in degrees, in place of a calibration; focal length, centre and
+    distortion (k1, k2) of the lens are then estimated.
     With neither, a typical field of view is assumed."""
     reference: Path | None = None
     """Reference trajectory in TUM format, for the absolute trajectory error. Default: that of the

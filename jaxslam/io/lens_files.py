@@ -3,7 +3,7 @@ ORB-SLAM, JSON of any of their keys, and COLMAP's `cameras.txt`."""
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,18 +27,12 @@ _DISTORTION = (
     "distortion_coefficients.data", "distortion_coefficients", "distortion_coeffs",
     "dist_coeff.data", "dist_coeff", "dist_coeffs", "D.data", "D", "distortion",
 )  # fmt: skip
-_COLMAP: dict[str, Callable[..., tuple[float, ...]]] = {
-    "SIMPLE_PINHOLE": lambda f, x, y: (f, f, x, y),
-    "PINHOLE": lambda *four: four,
-    "SIMPLE_RADIAL": lambda f, x, y, k: (f, f, x, y, k),
-    "RADIAL": lambda f, x, y, k1, k2: (f, f, x, y, k1, k2),
-    "OPENCV": lambda *eight: eight,
-    "FULL_OPENCV": lambda *twelve: twelve,
-    "SIMPLE_RADIAL_FISHEYE": lambda f, x, y, k: (f, f, x, y, k),
-    "RADIAL_FISHEYE": lambda f, x, y, k1, k2: (f, f, x, y, k1, k2),
-    "OPENCV_FISHEYE": lambda *eight: eight,
-}
-"""fx, fy, cx, cy and the distortion by the parameters of COLMAP's models."""
+_COLMAP = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
+    "FULL_OPENCV": 12, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8,
+}  # fmt: skip
+"""How many parameters COLMAP's models have: focal lengths, one of simple and radial ones, centre
+and distortion."""
 ACCEPTED = (
     "JSON with model, width, height, fx, fy, cx, cy, distortion; YAML of OpenCV, ROS, Kalibr, "
     "EuRoC or ORB-SLAM; or COLMAP's cameras.txt"
@@ -111,15 +105,14 @@ def _of_colmap(lines: Sequence[str]) -> Calibration:
     """The first camera; its pixels begin at the corner of the first one, ours in its middle."""
     name, *told = next(line.split()[1:] for line in lines if line[0].isdigit())
     values = numbers(told, len(told)) or []
-    try:
-        fx, fy, cx, cy, *distortion = _COLMAP[name](*values[2:])
-    except (KeyError, TypeError, ValueError):
+    if len(values) != 2 + _COLMAP.get(name, -2):
         known = ", ".join(_COLMAP)
-        raise ValueError(
-            f"unknown camera model {name} of {len(told)} numbers; known: {known}"
-        ) from None
-    size = int(values[0]), int(values[1])
+        raise ValueError(f"unknown camera model {name} of {len(told)} numbers; known: {known}")
+    width, height, focal, *rest = values
+    square = [focal] if name.startswith(("SIMPLE", "RADIAL")) else []
+    fx, fy, cx, cy, *distortion = [*square, focal, *rest]
     model, distortion = lens(["fisheye"] if name.endswith("FISHEYE") else [], distortion)
+    size = int(width), int(height)
     return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=distortion, model=model)
 
 

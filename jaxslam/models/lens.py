@@ -59,7 +59,7 @@ class AbstractLens(eqx.Module):
         return jnp.append(flat, 1.0)
 
     def depth(self, point: Point) -> Scalar:
-        """The depth of a point, of which a pixel tells nothing: z."""
+        """The depth of a point, which no pixel shows: z."""
         return point[-1]
 
     def sees(self, point: Point) -> Bool[Array, ""]:
@@ -81,9 +81,9 @@ class AbstractBent(AbstractLens):
     """A lens that bends the plane of an ideal one of its kind."""
 
     k1: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r² (of a fisheye, θ²), no unit."""
+    """The coefficient of r² (of a fisheye, θ²), no unit."""
     k2: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r⁴ (θ⁴)."""
+    """The coefficient of r⁴ (θ⁴)."""
 
     @abstractmethod
     def bent(self, flat: Place) -> Place:
@@ -121,11 +121,11 @@ class RadialTangential(AbstractBent):
     """OpenCV's five numbers, ROS's `plumb_bob`, Kalibr's `radtan` (Brown, 1966)."""
 
     p1: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of the tangential part."""
+    """A coefficient of the tangential part."""
     p2: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of the tangential part."""
+    """A coefficient of the tangential part."""
     k3: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r⁶."""
+    """The coefficient of r⁶."""
 
     def bent(self, flat: Place) -> Place:
         """`x (1 + k1 r² + k2 r⁴ + k3 r⁶ + 2 s·x) + s r²` with s = (p2, p1)."""
@@ -138,17 +138,17 @@ class Rational(AbstractBent):
     """OpenCV's eight numbers, ROS's `rational_polynomial`, for wide lenses."""
 
     p1: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of the tangential part."""
+    """A coefficient of the tangential part."""
     p2: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of the tangential part."""
+    """A coefficient of the tangential part."""
     k3: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r⁶."""
+    """The coefficient of r⁶."""
     k4: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r², in the denominator."""
+    """The coefficient of r² in the denominator."""
     k5: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r⁴, in the denominator."""
+    """The coefficient of r⁴ in the denominator."""
     k6: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of r⁶, in the denominator."""
+    """The coefficient of r⁶ in the denominator."""
 
     def bent(self, flat: Place) -> Place:
         """As `RadialTangential`, its polynomial divided by `1 + k4 r² + k5 r⁴ + k6 r⁶`."""
@@ -163,9 +163,9 @@ class Fisheye(AbstractBent):
     which may see more than a half-space. Its rays have unit length, and depth is the distance."""
 
     k3: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of θ⁶."""
+    """The coefficient of θ⁶."""
     k4: Float[AnyArray, ""] = number_field(default=0.0)
-    """Of θ⁸."""
+    """The coefficient of θ⁸."""
 
     def bent(self, flat: Place) -> Place:
         """`x (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, θ = |x|."""
