@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from jaxslam.native.emit import PRELUDE, CppSource
 
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
-    *("-ffp-contract=fast", "-Wno-psabi", "-shared", "-fPIC"),
+    *("-ffp-contract=fast", "-Wno-psabi", "-fPIC"),
 )
 
 
@@ -95,15 +96,27 @@ def _digest(path: Path) -> str:
 
 
 def _compile(command: list[str], source: CppSource, path: Path) -> None:
+    """Compile the parts, as many at a time as there are processors, and link them."""
     with tempfile.TemporaryDirectory() as folder:
         file, tables = (Path(folder) / name for name in ("program.cpp", "tables"))
         file.write_text(source.text)
         tables.write_bytes(source.tables)
-        arguments = [*command, *FLAGS, f'-DTABLES="{tables}"', str(file), "-o", str(path), "-lm"]
-        try:
-            done = subprocess.run(arguments, capture_output=True, text=True, timeout=LIMIT_SECONDS)
-        except subprocess.TimeoutExpired:
-            raise ValueError(f"the C++ compiler did not end within {LIMIT_SECONDS:.0f} s") from None
+        objects = [str(Path(folder) / f"{part}.o") for part in range(source.parts)]
+
+        def compiled(part: int) -> None:
+            what = [f'-DTABLES="{tables}"', f"-DPART={part}", "-c", str(file), "-o", objects[part]]
+            _called([*command, *FLAGS, *what])
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(compiled, range(source.parts)))
+        _called([*command, *FLAGS, "-shared", *objects, "-o", str(path), "-lm"])
+
+
+def _called(arguments: list[str]) -> None:
+    try:
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=LIMIT_SECONDS)
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"the C++ compiler did not end within {LIMIT_SECONDS:.0f} s") from None
     if done.returncode:
         raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")
 

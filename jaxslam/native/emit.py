@@ -20,6 +20,8 @@ TILES = ((4, 6), (6, 4), (4, 4), (3, 8), (8, 3), (2, 10), (10, 2), (1, 14), (14,
 """Sums that a product keeps in registers, of which there are 32 with vectors of 64 bytes …"""
 TILES_OF_FEW = ((3, 4), (4, 3), (3, 3), (2, 6), (6, 2), (1, 10), (10, 1))
 """… and 16 with shorter ones."""
+PART = 250_000
+"""Characters that one compiler is given: so many work at a time."""
 PUTS = {None: "'='", "add": "'+'", "mul": "'*'", "min": "'<'", "max": "'>'"}
 """What `put` in the prelude makes of two numbers at one place."""
 VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
@@ -27,9 +29,13 @@ VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
 
 
 class CppSource(NamedTuple):
-    """A program in C++, and the constant arrays that it finds in the file `TABLES`."""
+    """A program in C++, and the constant arrays that it finds in the file `TABLES`.
+
+    Its functions are those of several parts; `PART` says which of them is compiled.
+    """
 
     text: str
+    parts: int
     tables: bytes
 
 
@@ -48,7 +54,13 @@ def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]], vector: 
         head += [f"#if defined({needed}) && defined(__x86_64__) && defined(__gnu_linux__)"]
         head += [f"#define VECTOR_MATH(x) {name}", "#endif"]
     head.append(PRELUDE.read_text())
-    return CppSource("\n".join([*head, *writer.functions, entry]), writer.tables.data)
+    ends = np.cumsum([len(x) for x in (*writer.functions, entry)])
+    head += [f"HIDDEN void f{k}(char *m);" for k in range(len(writer.functions))]
+    pieces = [
+        f"#if PART == {end // PART}\n{text}\n#endif"
+        for end, text in zip(ends, (*writer.functions, entry), strict=True)
+    ]
+    return CppSource("\n".join([*head, *pieces]), int(ends[-1]) // PART + 1, writer.tables.data)
 
 
 class _Tables:
@@ -98,9 +110,7 @@ class _Writer:
             self.local = outer
             name = f"f{len(self.functions)}"
             text = "\n".join(x for x in body if x)
-            self.functions.append(
-                f"static __attribute__((noinline)) void {name}(char *m) {{\n{text}\n}}"
-            )
+            self.functions.append(f"HIDDEN void {name}(char *m) {{\n{text}\n}}")
             calls.append(f"{name}(m);")
         return " ".join(calls)
 

@@ -308,6 +308,7 @@ class _Places:
     clock: int = 0
 
     def __post_init__(self) -> None:
+        self.operations: dict[int, tuple[Refs, Refs]] = {}
         self.block_of, self.over, self.born, self.last = (
             np.full(self.plan.live.size, -1, np.int64) for _ in range(4)
         )
@@ -429,12 +430,18 @@ class _Places:
         return refs[self.plan.live[refs]]
 
     def apply(self, step, around) -> None:
+        made, used = self.operations.get(id(step)) or self.described(step)
+        self.write(made, around)
+        self.read(used, around)
+
+    def described(self, step: Apply) -> tuple[Refs, Refs]:
+        """What is in memory of operations: their results, and what these are of."""
         plan = self.plan
         made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
-        self.write(made, around)
-        for form in np.unique(plan.form[made]).tolist():
-            for refs in plan.leaves(made[plan.form[made] == form]):
-                self.read(refs, around)
+        forms = plan.form[made]
+        used = [x for form in np.unique(forms) for x in plan.leaves(made[forms == form])]
+        self.operations[id(step)] = made, np.concatenate([made[:0], *used])
+        return self.operations[id(step)]
 
     def loop(self, step, around) -> None:
         begin = self.clock

@@ -6,11 +6,14 @@
 typedef SCALAR V __attribute__((vector_size(WIDTH * sizeof(SCALAR)), may_alias, aligned(sizeof(SCALAR) * WIDTH)));
 constexpr int W = WIDTH;
 
-// Constant arrays, from a file.
-#ifdef __APPLE__
-asm(".const_data\n.balign 64\n_jaxslam_tables:\n.incbin \"" TABLES "\"\n.text");
+#define HIDDEN __attribute__((noinline, visibility("hidden")))
+
+// Constant arrays, from a file, in the first part.
+#if PART
+#elif defined(__APPLE__)
+asm(".const_data\n.balign 64\n.globl _jaxslam_tables\n.private_extern _jaxslam_tables\n_jaxslam_tables:\n.incbin \"" TABLES "\"\n.text");
 #else
-asm(".pushsection .rodata\n.balign 64\njaxslam_tables:\n.incbin \"" TABLES "\"\n.popsection");
+asm(".pushsection .rodata\n.balign 64\n.globl jaxslam_tables\n.hidden jaxslam_tables\njaxslam_tables:\n.incbin \"" TABLES "\"\n.popsection");
 #endif
 extern "C" const char jaxslam_tables[] __attribute__((visibility("hidden")));
 
