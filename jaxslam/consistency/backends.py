@@ -20,6 +20,7 @@ from jaxslam._runtime.programs import BATCHED, QUICK, Program, in_background
 from jaxslam._runtime.watchdog import finished, lapack_calls
 from jaxslam.consistency.runs import filter_run, map_and_path
 from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run
@@ -154,7 +155,7 @@ def chosen(
 ) -> str:  # fmt: skip
     """Return the backend that computes so many runs of a filter, of which these are the first.
 
-    `AUTO` is the native backend on a CPU with a C++ compiler for a `Slam` without layers
+    `AUTO` is the native backend on a CPU with a C++ compiler for a `Slam` of one Gaussian or a sum
     whose state is at most `LARGEST`, if there are `WORTH` steps or its program exists; else XLA.
     Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
     too, with a warning unless the choice was open.
@@ -163,7 +164,8 @@ def chosen(
 
     able = backend != "xla" and jax.default_backend() == "cpu" and compiler() is not None
     there = able and native_programs().is_there(room, (slam, sensor), runs)
-    faster = isinstance(slam, AbstractSlam) and not slam.layered and _numbers(room, runs) <= LARGEST
+    small = isinstance(slam, AbstractSlam) and _numbers(room, runs) <= LARGEST
+    faster = small and (not slam.layered or isinstance(slam.layer, Mixture))
     long = count * (runs.visible.shape[1] - 1) >= WORTH
     if backend == "xla" or (backend == AUTO and not (able and faster and (there or long))):
         return "xla"

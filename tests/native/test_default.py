@@ -79,13 +79,22 @@ def test_what_is_kept_of_the_first_run_does_not_hold_the_others():
     assert all(np.asarray(x).base is None for x in sample.values())
 
 
-def test_a_filter_with_a_mixture_stays_with_xla(pretended):
-    (slam,) = jaxslam.make_filters(SCENARIO, "scale_gauge+mixture3", "inverse_scaling").values()
+@pytest.mark.parametrize("name", ["scale_gauge+mixture3+rest4", "robocentric+checked"])
+def test_a_filter_with_more_around_than_a_sum_stays_with_xla(name, pretended):
+    (slam,) = jaxslam.make_filters(SCENARIO, name, "inverse_scaling").values()
     room, runs = draw(SCENARIO, 2)
-    for there in (False, True):  # by a program in C++ a sum takes twice as long
+    for there in (False, True):
         pretended.there = there
         assert backends.chosen("auto", NAME, 10**6, slam, room, SCENARIO.sensor, runs) == "xla"
     assert pretended.asked == 0
+
+
+@pytest.mark.slow
+def test_a_sum_takes_the_native_backend(pretended):
+    (slam,) = jaxslam.make_filters(SCENARIO, "scale_gauge+mixture3", "inverse_scaling").values()
+    room, runs = draw(SCENARIO, 2)
+    found = backends.chosen("auto", NAME, 10**6, slam, room, SCENARIO.sensor, runs)
+    assert (found, pretended.asked) == ("native", 1)
 
 
 @pytest.mark.parametrize("backend", quick_rows(1, ["native", "auto"]))

@@ -8,17 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import quick_jit, quick_rows
+from jax.extend.core import jaxprs_in_params
 
 import jaxslam
 from jaxslam import linalg
+from jaxslam._numerics.arrays import cast
+from jaxslam._numerics.conditional import at_places, map_or_zero, map_where
+from jaxslam._numerics.tracing import free_gathers
 from jaxslam._runtime import programs
+from jaxslam.consistency import backends, draw
 from jaxslam.consistency.store import NATIVE
+from jaxslam.landmarks import LANDMARKS
 from jaxslam.native import NativePrograms, NotSupportedError, batch, batched, build
 from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
-from jaxslam.native.elements import Elements
-from jaxslam.native.trace import MOVES
+from jaxslam.native.elements import OPERATIONS, Elements
+from jaxslam.native.plan import each, plan
+from jaxslam.native.program import Loop
+from jaxslam.native.trace import INNER, MOVES, RULES, program
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
 RUNS = 11
@@ -84,6 +92,37 @@ def loop_that_runs_leave(shared, A):
     )
 
 
+def living_rows(shared, A):
+    """A sum, as a filter has it: so many rows of each run are alive, and two change places."""
+
+    def one(value):
+        P = value["P"] @ value["P"].T * 0.3 + shared[0]
+        return {**value, "P": P / jnp.sqrt(jnp.sum(P**2)), "turns": value["turns"] + 1}
+
+    def turn(values, x):
+        alive = jnp.arange(4) < jnp.sum(A[0] > x[0]) % 5
+        values = map_where(one, values, alive.at[1].set(x[1] > 0))
+        places = jnp.argsort(x[:4])[None, :2]
+
+        def swapped(two, of, _):
+            return {**jax.tree.map(lambda v: v[::-1], two), "turns": two["turns"] + of}
+
+        values = at_places(swapped, values, values["turns"], places, x[2:3] > 0, None)
+        return values, map_or_zero(lambda value: jnp.sum(value["P"]), values, alive)
+
+    start = {"P": A.reshape(4, 6, 6), "turns": jnp.zeros(4), "fixed": A[:4]}
+    return jax.lax.scan(turn, start, jnp.tile(A, (6, 1)))
+
+
+def carries_that_change_places(shared, A):
+    def turn(carry, x):
+        first, second = carry
+        k = jnp.argmax(x)
+        return (second.at[k].add(x[0]), first.at[k, 0].set(x[1])), first[k]
+
+    return jax.lax.scan(turn, (A, 2 * A), jnp.tile(A, (40, 1)))
+
+
 def products(shared, A):
     B, picked = A @ A.T + jnp.eye(12), jnp.arange(12) % 5 == jnp.arange(12)[:, None] % 5
     sparse = jnp.where(picked, A, 0.0)
@@ -105,7 +144,7 @@ def derivative(shared, A):
 
 CASES = (
     fixed_indices, indices_of_a_run, few_that_are_written_over, numbers, branches, loops,
-    loop_that_runs_leave, products, factors, derivative,
+    loop_that_runs_leave, living_rows, carries_that_change_places, products, factors, derivative,
 )  # fmt: skip
 
 
@@ -446,7 +485,60 @@ def test_longer_sums_and_loops_are_no_longer_programs(monkeypatch):
     assert lines(3000) == lines(100)
 
 
+def test_rows_stay_where_they_are():
+    """A sum is written over itself: a copy of all places costs more than what is computed."""
+    shapes = (jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (SHARED, DRAWN[0]))
+    planned = plan(program(living_rows, *shapes)[0])
+    loops = []
+    each(planned.program.steps, lambda step: loops.append(step) if isinstance(step, Loop) else None)
+    (outer,) = (x for x in loops if x.length == 72)
+    inner = [x for x in loops if x.count is not None and x.held is not None]
+    assert len(inner) == 2  # and what a run puts at places of its own
+    assert all(x.length == 4 for x in inner)
+    live = planned.live[outer.carry]
+    moved = planned.slot[outer.after[live]] != planned.slot[outer.carry[live]]
+    assert live.sum() >= 4 * 36
+    assert moved.sum() <= 4
+
+
+WORDS = (
+    "scale_gauge+oc", "recommended+mixture3", "robocentric", "world", "keyframe", "scale_gauge",
+    "invariant", "recommended", "world+fej", "robocentric+iterated3", "robocentric+drift",
+    "robocentric+scene50",
+    "scale_gauge+scene50+walk3", "scale_gauge+directions3", "recommended+submaps",
+    "robocentric+checked", "recommended+rest4", "robocentric+particles3", "robocentric+rays3",
+)  # fmt: skip
+"""Every filter, and every word that may stand behind one."""
+
+
+def primitives(jaxpr):
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in jaxprs_in_params(equation.params):
+            yield from primitives(inner)
+
+
+@pytest.mark.parametrize("landmark", quick_rows(1, list(LANDMARKS)))
+@pytest.mark.parametrize("word", quick_rows(2, WORDS))
+def test_every_filter_has_a_native_program(word, landmark):
+    """So far as every primitive of it has a rule."""
+    world = jaxslam.scenario("matched", steps=3, landmarks=3)
+    try:
+        (slam,) = jaxslam.make_filters(world, [word], [landmark]).values()
+    except ValueError as error:
+        pytest.skip(str(error))
+    room, runs = draw(world, 1)
+    pieces = cast(slam, "float64"), cast(world.sensor, "float64")
+    with jax.enable_x64(True), free_gathers():
+        one = jax.tree.map(lambda x: x[0], runs)
+        traced = jax.make_jaxpr(lambda run: backends._records_and_map(room, pieces, run))(one)
+    known = {*INNER, *MOVES, *RULES, *OPERATIONS}
+    assert set(primitives(traced.jaxpr)) <= known
+
+
 FILTERS = (
+    ("scale_gauge+oc+scene50", "inverse_scaling"),
+    ("recommended+mixture3", "inverse_scaling"),
     ("robocentric", "inverse_scaling"),
     ("world", "inverse_depth"),
     ("scale_gauge+mixture3", "inverse_scaling"),
