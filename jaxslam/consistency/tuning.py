@@ -24,8 +24,8 @@ from jaxtyping import Array, Float
 from jaxslam._numerics.arrays import AnyArray, cast, is_number
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import whitened_innovation
 from jaxslam.filters.run import Frames, MeasuredRun, run
-from jaxslam.linalg import cholesky
 from jaxslam.models.observations import Capacity, Features
 from jaxslam.statistics.bands import normalised_squared, whiteness_p_value
 
@@ -453,11 +453,9 @@ def _run_records(slam: AbstractFilter, log: MeasuredRun) -> tuple[_Records, _OfF
     """The records of every frame of a log, and its whitened innovations and errors."""
 
     def output(state, innovation, frame):
-        found, shape, S = innovation.residual, innovation.residual.shape, innovation.covariance
-        white = None
-        if S is not None:
-            white = (cholesky(S).whitening @ found.ravel()).reshape(shape)
-            none = jnp.full((log.capacity.landmarks, shape[1]), jnp.nan)
+        white = whitened_innovation(innovation)
+        if white is not None:
+            none = jnp.full((log.capacity.landmarks, white.shape[1]), jnp.nan)
             place = jnp.where(innovation.used, frame.seen.slots, len(none))
             white = none.at[place].set(white, mode="drop")
         return (*_records(slam, state, innovation, frame), white, state)

@@ -20,14 +20,23 @@ from jaxslam.filters.protocol import (
     OfLandmark,
 )
 from jaxslam.geometry import Pose, Scalar, retract, scaled
-from jaxslam.linalg import semidefinite_root
-from jaxslam.models.observations import Slots
+from jaxslam.linalg import cholesky, semidefinite_root
+from jaxslam.models.observations import Innovation, Slots
 from jaxslam.models.sensors import AbstractSensor
 
 
 def camera_pose(slam: AbstractFilter, state: Belief) -> tuple[Pose, Float[Array, "t t"]]:
     """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
     return slam.marginal(state, lambda view: view.pose)
+
+
+def whitened_innovation(innovation: Innovation) -> Float[Array, "m p"] | None:
+    """The residuals whitened by their joint covariance, `L⁻¹ r` with `L Lᵀ = S`: independent and of
+    unit variance if the filter is right. None where it keeps no S."""
+    if innovation.covariance is None:
+        return None
+    whitening = cholesky(innovation.covariance).whitening
+    return (whitening @ innovation.residual.ravel()).reshape(innovation.residual.shape)
 
 
 class InUnit(NamedTuple):
