@@ -21,7 +21,7 @@ MODELS = {
 GUESSED_FIELD_OF_VIEW = 65.0
 """Degrees along the longer side: between a phone that films and a webcam."""
 LENS_SIGMA = (0.15, 0.05)
-"""σ of k1 and k2 of a lens of which nothing, or only the field of view, is known: phones'."""
+"""σ of k1 and k2, as phones differ, of a lens of which at most the field of view is given."""
 _GUESSED_SHARE, _TOLD_SHARE, _CENTRE_SHARE = 0.15, 0.05, 0.02
 """σ of a focal length that is guessed, and of one that a field of view tells (cropped by who knows
 what), as shares of it; σ of the principal point as a share of the longer side."""
