@@ -111,10 +111,6 @@ def at_places(
         due = jnp.where(wanted[:, None], places, jnp.iinfo(places.dtype).max)
         return jax.tree.map(lambda x, new: x.at[due].set(new, mode="drop"), values, after)
 
-    @jax.custom_jvp
-    def done(*data):
-        return work(*data)
-
     @custom_vmap
     def work(values, sources, places, wanted, shared):
         def one(k, values):
@@ -135,6 +131,7 @@ def at_places(
         after = _in_blocks(call, *spread, data[-1], batched[-1])
         return after, jax.tree.map(lambda _: True, after)
 
+    done = jax.custom_jvp(lambda *data: work(*data))
     done.defjvp(partial(jax.jvp, each))
     return done(values, sources, places, wanted, (arrays, given))
 

@@ -139,7 +139,7 @@ def _near(steps: list[Step], size: int) -> list[Step]:
     of = np.maximum(of[check.refs], known)
     parts = [check.refs[of == number] for number in range(-1, len(steps))]
     at = [[replace(check, refs=refs)] if refs.size else [] for refs in parts]
-    result = at[0]
+    result: list[Step] = [*at[0]]
     for step, checked in zip(steps, at[1:], strict=True):
         result += [step, *checked]
     return result
