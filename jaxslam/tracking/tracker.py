@@ -41,8 +41,8 @@ from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
 
 SAME, NEARLY, MOST_APART = 0.5, 0.1, 2.0
-"""RMS of the difference of two pictures that are one, grey levels: in any case, as a share of what
-a picture changed before, and at most. A camera's own noise is more; what a film's compression
+"""RMS of the difference of two pictures that are one, in grey levels: always, as a share of what a
+picture changed before, and its limit. A camera's own noise is more; what a film's compression
 leaves of it is less."""
 MOST_REPEATS = 3
 """Pictures in a row that are taken for one which a film has several times."""
