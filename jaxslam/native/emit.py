@@ -44,7 +44,7 @@ def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]], vector: 
     whether every run has its own, and the types of what comes out."""
     writer = _Writer(plan, vector)
     body = writer.function(plan.program.steps)
-    entry = writer.entry(body, *kinds)
+    entry = _entry(writer, body, *kinds)
     double = writer.elements.dtype == np.float64
     width = vector // writer.elements.dtype.itemsize
     head = [f"#define SCALAR {'double' if double else 'float'}", f"#define WIDTH {width}"]
@@ -369,35 +369,34 @@ class _Writer:
         turn = [condition, f"if (!l_any({going})) break;", body, select]
         return "\n".join([begin, "for (;;) {", *turn, "}"])
 
-    def entry(self, body: str, inputs: list[tuple[Any, bool]], outputs: list[Any]) -> str:
-        """The function that is called from outside, for `count` runs from `first` on."""
-        program, lines = self.plan.program, []
-        constants = np.flatnonzero(self.plan.live & (self.elements.code == CONSTANT))
-        values = self.tables(self.elements.value[constants], "SCALAR")
-        places = self.tables(self.offset(constants))
-        lines.append(
-            f"for (long e = 0; e < {constants.size}; ++e) AT({places}[e]) = C({values}[e]);"
-        )
-        lines.append(f"AT({self.trash}) = AT({self.doubt}) = ZERO;")
-        for k, (refs, (kind, own)) in enumerate(zip(program.inputs, inputs, strict=True)):
-            if refs.size and self.plan.live[refs].any():
-                begin, each = int(self.offset(refs.ravel()[:1])[0]), int(own)
-                call = f"(m, in[{k}], {refs.size}, {begin}, first, count, {each});"
-                lines.append(f"load<{_type(kind)}>{call}")
-        lines.append(body)
-        for k, (refs, kind) in enumerate(zip(program.outputs, outputs, strict=True)):
-            if refs.size:
-                at = self.tables(self.offset(refs))
-                lines.append(f"store<{_type(kind)}>(m, out[{k}], {refs.size}, {at}, first, count);")
-        lines.append(
-            f"for (long l = 0; l < count; ++l) doubted[first + l] = AT({self.doubt})[l] != 0;"
-        )
-        size = (self.plan.slots + 2) * self.bytes
-        return "\n".join([
-            f'extern "C" long arena() {{ return {size}; }}',
-            'extern "C" void run(char *m, const void *const *in, void *const *out, bool *doubted, '
-            "long first, long count) {", *lines, "}\n",
-        ])  # fmt: skip
+
+def _entry(writer: _Writer, body: str, inputs: list[tuple[Any, bool]], outputs: list[Any]) -> str:
+    """The function that is called from outside, for `count` runs from `first` on."""
+    program, lines = writer.plan.program, []
+    constants = np.flatnonzero(writer.plan.live & (writer.elements.code == CONSTANT))
+    values = writer.tables(writer.elements.value[constants], "SCALAR")
+    places = writer.tables(writer.offset(constants))
+    lines.append(f"for (long e = 0; e < {constants.size}; ++e) AT({places}[e]) = C({values}[e]);")
+    lines.append(f"AT({writer.trash}) = AT({writer.doubt}) = ZERO;")
+    for k, (refs, (kind, own)) in enumerate(zip(program.inputs, inputs, strict=True)):
+        if refs.size and writer.plan.live[refs].any():
+            begin, each = int(writer.offset(refs.ravel()[:1])[0]), int(own)
+            call = f"(m, in[{k}], {refs.size}, {begin}, first, count, {each});"
+            lines.append(f"load<{_type(kind)}>{call}")
+    lines.append(body)
+    for k, (refs, kind) in enumerate(zip(program.outputs, outputs, strict=True)):
+        if refs.size:
+            at = writer.tables(writer.offset(refs))
+            lines.append(f"store<{_type(kind)}>(m, out[{k}], {refs.size}, {at}, first, count);")
+    lines.append(
+        f"for (long l = 0; l < count; ++l) doubted[first + l] = AT({writer.doubt})[l] != 0;"
+    )
+    size = (writer.plan.slots + 2) * writer.bytes
+    return "\n".join([
+        f'extern "C" long arena() {{ return {size}; }}',
+        'extern "C" void run(char *m, const void *const *in, void *const *out, bool *doubted, '
+        "long first, long count) {", *lines, "}\n",
+    ])  # fmt: skip
 
 
 def _number(value: float) -> str:

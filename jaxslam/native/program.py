@@ -90,9 +90,9 @@ class Loop:
     """Row t is what `results` are in turn t."""
     results: Refs
     count: Refs | None = None
-    """One: so many turns at the most, of each run …"""
+    """One number: the turns that a run has, `length` or fewer."""
     held: Refs | None = None
-    """… after which this is what stays in `written`."""
+    """This stays in `written` where a run has no further turn."""
 
 
 @dataclass(frozen=True)

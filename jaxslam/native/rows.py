@@ -9,7 +9,7 @@ from jaxslam.native.plan import each
 from jaxslam.native.program import Apply, Step, read_by, read_in_turn
 
 
-class Rows:
+class RowLoop:
     """Rows that stand one after the other in memory: all runs are at the same, in every turn."""
 
     def __init__(self, elements: Elements, length: int) -> None:

@@ -28,7 +28,7 @@ from jaxslam.native.program import (
     Take,
     While,
 )
-from jaxslam.native.rows import Rows
+from jaxslam.native.rows import RowLoop
 
 UNROLLED = 3000
 """Operations up to which all turns of a loop are written out: their indices are then known."""
@@ -77,7 +77,7 @@ class Tracer:
         """Up to here, integers are numbers."""
         self.going: Refs | None = None
         """Where the loops around are still going on."""
-        self.rows: list[Rows] = []
+        self.rows: list[RowLoop] = []
         """Those that the loops around read and write."""
         self.whole = False
         """Whether sums are of integers."""
@@ -806,7 +806,7 @@ def _counted(tracer, p, arguments):
         return None
     length = len(start[arrays[0]])
     with tracer.aside() as steps:
-        rows, around = Rows(tracer.elements, length), tracer.going
+        rows, around = RowLoop(tracer.elements, length), tracer.going
         going = tracer.apply("lt", rows.turn, limit)
         tracer.going = going if around is None else tracer.apply("and", going, around)
         tracer.rows.append(rows)
