@@ -7,12 +7,6 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit, run_filter
 
-from jaxslam import monte_carlo, scenario
-from jaxslam.models.camera import Camera
-from jaxslam.models.lens import Fisheye, RadialTangential
-from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation.world import ConstantCalibration
-
 CALIBRATION = slice(9, 11)
 """Where the error of (f, c) is in the state: after the pose, the velocity and the noise."""
 VARIANCES = np.array([3.0, 2.0]) ** 2
@@ -75,21 +69,3 @@ def test_a_calibration_without_uncertainty_is_a_known_one(calibration):
     assert not covariances[:, CALIBRATION].any()
     without = np.delete(np.delete(covariances, CALIBRATION, 1), CALIBRATION, 2)
     np.testing.assert_allclose(without, known_covariances, rtol=0, atol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lens", [RadialTangential(), Fisheye()], ids=["pinhole", "fisheye"])
-def test_a_filter_that_estimates_an_untold_lens_is_consistent(lens):
-    """Focal length, centre, k1 and k2 are drawn once a run from their prior, a phone's."""
-    sigma = np.array([20.0, 6.0, 6.0, 0.1, 0.03])
-    camera = Camera([400.0, 400.0], [320.0, 240.0], lens)
-    world = replace(
-        scenario("matched-6dof-tight", steps=25),
-        sensor=Pinhole(camera, 0.3),
-        calibration=ConstantCalibration(sigma),
-        treatment="estimated",
-    )
-    study = monte_carlo(world, ["robocentric"], runs=60, backend="xla")["robocentric"]
-    # χ² of 6 degrees of freedom over 60 runs: 99.9 % are within 4.7 and 7.5.
-    assert 4.7 < study.nees.mean[-1] < 7.5
-    assert study.nees.mean.mean() < 7.5
