@@ -68,7 +68,7 @@ class TrackOptions:
     ] = TrackerSettings.landmarks
     calibration_treatment: str | None = TrackerSettings.calibration
     """How the filter treats the calibration: white, consider, estimated or known. Default:
-    estimated for a guessed lens or --fov, otherwise known."""
+    estimated, with the σ that it states, or else 0.3 % of the focal lengths."""
     nearest_depth: float = TrackerSettings.nearest_depth
     """Smallest expected depth, d_min, which sets the map unit: the prior on depth extends from here
     to infinity."""

@@ -30,6 +30,8 @@ AUTO = "auto"
 """The backend of a study for which none is asked: `chosen` says which it is."""
 WORTH = 100_000
 """The steps of all runs of a filter from which on the native backend pays for its compilation."""
+WORTH_OF_SUMS = 400_000
+"""The same of a Gaussian sum in a plane; in space it takes minutes to build."""
 LARGEST = 200
 """The numbers of a state up to which it is faster; its program grows with them."""
 FIRST_RUNS = 8
@@ -155,8 +157,9 @@ def chosen(
 ) -> str:  # fmt: skip
     """Return the backend that computes so many runs of a filter, of which these are the first.
 
-    `AUTO` is the native backend on a CPU with a C++ compiler for a `Slam` of one Gaussian or a sum
-    whose state is at most `LARGEST`, if there are `WORTH` steps or its program exists; else XLA.
+    `AUTO` is the native backend on a CPU with a C++ compiler for a `Slam` of one Gaussian, or a
+    sum in a plane, whose state is at most `LARGEST`, if there are `WORTH` steps or its program
+    exists; else XLA.
     Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
     too, with a warning unless the choice was open.
     """
@@ -165,8 +168,9 @@ def chosen(
     able = backend != "xla" and jax.default_backend() == "cpu" and compiler() is not None
     there = able and native_programs().is_there(room, (slam, sensor), runs)
     small = isinstance(slam, AbstractSlam) and _numbers(room, runs) <= LARGEST
-    faster = small and (not slam.layered or isinstance(slam.layer, Mixture))
-    long = count * (runs.visible.shape[1] - 1) >= WORTH
+    of_sum = small and isinstance(slam.layer, Mixture) and runs.poses.tangent_dim == 3
+    faster = small and (of_sum or not slam.layered)
+    long = count * (runs.visible.shape[1] - 1) >= (WORTH_OF_SUMS if of_sum else WORTH)
     if backend == "xla" or (backend == AUTO and not (able and faster and (there or long))):
         return "xla"
     few = min(len(runs.visible), FIRST_RUNS if count >= 64 * FIRST_RUNS else 2)

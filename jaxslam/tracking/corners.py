@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from jaxslam.tracking.patches import Picture, Pixels, Places
+from jaxslam.tracking.patches import Picture
+from jaxslam.tracking.pose_with_covariance import Pixels, Places
 from jaxslam.tracking.settings import TrackerSettings
 
 _CELLS = (8, 6)  # columns and rows of the grid that corners are spread over

@@ -44,9 +44,8 @@ from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
-from jaxslam.tracking.patches import Pixels
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
-from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
+from jaxslam.tracking.pose_with_covariance import Pixels, Positions, Spreads, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 LIVELY = 20.0

@@ -17,7 +17,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations, Slots
-from jaxslam.tracking.patches import Patch, Picture, Pixels
+from jaxslam.tracking.patches import Patch, Picture
 from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.submaps import (
     Compared,
@@ -27,6 +27,7 @@ from jaxslam.tracking.places.submaps import (
     compile_graph,
     handed_over,
 )
+from jaxslam.tracking.pose_with_covariance import Pixels
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import Join, MapInWorld, Nearness, nearness
 

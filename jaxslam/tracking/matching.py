@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from jaxslam.tracking.observations import Slots
-from jaxslam.tracking.patches import Picture, Pixels, Places, Window
+from jaxslam.tracking.patches import Picture, Window
+from jaxslam.tracking.pose_with_covariance import Pixels, Places
 
 Windows = Float32[np.ndarray, "n window window"]
 """Pictures of n landmarks as they should look now."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.tracking.patches import Pixels
+from jaxslam.tracking.pose_with_covariance import Pixels
 
 Slots = Int[np.ndarray, " k"]
 """The slots of k landmarks in the filter's map."""

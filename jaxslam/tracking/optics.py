@@ -14,8 +14,7 @@ from jaxslam._runtime.programs import Program
 from jaxslam.io.calibration import MODELS, Calibration
 from jaxslam.models.camera import Camera, project, ray
 from jaxslam.models.lens import LENSES, Ideal
-from jaxslam.tracking.patches import Places
-from jaxslam.tracking.pose_with_covariance import Positions
+from jaxslam.tracking.pose_with_covariance import Places, Positions
 
 LEAST = 128
 """Rows for which the programs are compiled at least; more have twice as many."""

@@ -9,7 +9,8 @@ from jaxtyping import Float, Int32, UInt8
 
 from jaxslam.io.source import Frame
 from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.patches import Picture, Pixels
+from jaxslam.tracking.patches import Picture
+from jaxslam.tracking.pose_with_covariance import Pixels
 from jaxslam.tracking.report import Tracked
 
 Lines = Float[np.ndarray, "k p 2"]

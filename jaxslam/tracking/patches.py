@@ -12,12 +12,8 @@ from jaxtyping import Float, Float32, UInt8
 
 Picture = UInt8[np.ndarray, "h w"]
 """A grey picture."""
-Pixels = Float[np.ndarray, "k 2"]
-"""Pixels (u, v) of k landmarks."""
 Window = Float32[np.ndarray, "window window"]
 """The picture of a landmark as it should look now."""
-Places = Float[np.ndarray, "n 2"]
-"""Pixels (u, v) of n points."""
 
 
 WINDOW = 15  # side of the matched window in pixels, odd

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import write_text
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.optics import sighted
-from jaxslam.tracking.patches import Places
-from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
+from jaxslam.tracking.pose_with_covariance import Places, Positions, Spreads, Transform
 
 _PROPERTIES = ("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 

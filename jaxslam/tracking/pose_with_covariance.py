@@ -13,6 +13,10 @@ from jaxtyping import Float
 
 Transform = Float[np.ndarray, "4 4"]
 """A pose as a matrix."""
+Pixels = Float[np.ndarray, "k 2"]
+"""Pixels (u, v) of k landmarks."""
+Places = Float[np.ndarray, "n 2"]
+"""Pixels (u, v) of n points."""
 Positions = Float[np.ndarray, "n 3"]
 """n points."""
 Spreads = Float[np.ndarray, "n 3 3"]

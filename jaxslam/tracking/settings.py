@@ -22,6 +22,9 @@ from jaxslam.tracking.optics import camera_of
 FIT = 36.0
 """The variance of a match by what it would be if its window's residual were white: distances from
 epipolar lines, rendered and real, are 5 to 8 times that σ at every quality of fit."""
+UNSTATED = 0.003
+"""σ of the focal lengths of a calibration that states none, as a share of them: of boards it is 1
+to 3 ‰, of what a data set publishes up to 12 ‰ (docs/sequences.md)."""
 METRIC = "world"
 """The filter where a target says how long a metre is."""
 
@@ -41,8 +44,8 @@ class TrackerSettings:
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str | None = None
-    """The treatment of the calibration: a name of TREATMENTS. By default, estimated for a guessed
-    lens or one from a field of view, otherwise known."""
+    """The treatment of the calibration: a name of TREATMENTS. By default it is estimated, with the
+    σ that it states, that of a guess, or else `focal_sigma` and `centre_sigma`."""
     association: str = "sequential"
     """Which matches are believed: a name of jaxslam.filters.association.ASSOCIATIONS."""
     tolerance: float = TOLERANCE
@@ -62,10 +65,10 @@ class TrackerSettings:
     it is unknown in metres."""
     pixel_sigma: float = 0.3
     """σ of a match whose window fits, pixels; of the others it is larger (`noise_factors`)."""
-    focal_sigma: float = 1.0
-    """σ of the focal lengths, pixels, of a calibration that states none and is not known."""
-    centre_sigma: float = 1.0
-    """σ of the principal point, pixels, of the same."""
+    focal_sigma: float | None = None
+    """σ of the focal lengths, pixels, of a calibration without one; by default 0.3 % of them."""
+    centre_sigma: float | None = None
+    """σ of the principal point, pixels, of the same; by default 0.15 % of the picture's width."""
     velocity_sigma: float = 0.5
     """σ of the initial linear velocity, 1/s."""
     angular_velocity_sigma: float = 1.0
@@ -135,6 +138,9 @@ class TrackerSettings:
     def treatment(self, calibration: Calibration) -> AbstractCalibration:
         """Return what the filter makes of a calibration, with the σ that it states or else with
         these."""
-        name = self.calibration or ("estimated" if calibration.guessed else "known")
-        sigma = list(calibration.sigma) or ([self.focal_sigma] * 2 + [self.centre_sigma] * 2)
-        return TREATMENTS[name]([*sigma[1:], *LENS_SIGMA] if calibration.guessed else sigma)
+        c = calibration
+        name = self.calibration or "estimated"
+        focal = self.focal_sigma or UNSTATED * max(c.fx, c.fy)
+        centre = self.centre_sigma or UNSTATED * c.width / 2
+        sigma = list(c.sigma) or [focal, focal, centre, centre]
+        return TREATMENTS[name]([*sigma[1:], *LENS_SIGMA] if c.guessed else sigma)

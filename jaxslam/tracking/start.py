@@ -9,7 +9,7 @@ import numpy as np
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.slam import Slam
 from jaxslam.models.frame import Robocentric, Submaps
-from jaxslam.tracking.patches import Places
+from jaxslam.tracking.pose_with_covariance import Places
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths
 

@@ -258,13 +258,20 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -
     if lens := _lens(tracker):
         for key, number in (("estimated", "value"), ("sigma", "sigma")):
             result[key] = {name: one[number] for name, one in lens.items() if name in INTRINSICS}
-    if camera[0] == "estimated":
+    if caveat_of(tracker):
         result["caveat"] = TOO_SURE
-    if camera[0] == "known":
+    if not tracker.calibration.guessed:
         better = better_lens(history, points, tracker.calibration)
         if better.left < CLEAR:
             result["better_lens"] = better.as_summary(tracker.calibration)
     return result
+
+
+def caveat_of(tracker: Tracker) -> str:
+    """The caveat on a lens of which nobody knew much."""
+    camera = tracker.camera()
+    estimated = camera is not None and camera[0] == "estimated"
+    return TOO_SURE if estimated and tracker.calibration.guessed else ""
 
 
 def _lens(tracker: Tracker) -> Summary:

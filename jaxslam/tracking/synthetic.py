@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Image, Source, Trajectory
-from jaxslam.tracking.patches import Picture, Places
-from jaxslam.tracking.pose_with_covariance import Positions, Transform
+from jaxslam.tracking.patches import Picture
+from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform
 
 NOISE = 2.0  # standard deviation of the sensor noise, in grey levels
 SUPERSAMPLING = 2

@@ -16,8 +16,8 @@ from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
 from jaxslam.tracking.optics import on_pinhole, rays
-from jaxslam.tracking.patches import Picture, Places
-from jaxslam.tracking.pose_with_covariance import Positions, Transform
+from jaxslam.tracking.patches import Picture
+from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform
 
 LEAST_POINTS = 4
 _IDEAL = np.zeros(0)

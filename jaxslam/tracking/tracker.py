@@ -27,14 +27,13 @@ from jaxslam.tracking.estimator import Correction, Estimator
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
-from jaxslam.tracking.patches import Pixels, Places
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import JERK, LEAST_MATCHES, Policy
-from jaxslam.tracking.pose_with_covariance import Transform
+from jaxslam.tracking.pose_with_covariance import Pixels, Places, Transform
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable

@@ -20,8 +20,8 @@ from jaxslam.tracking.pointcloud import write_ply
 from jaxslam.tracking.report import TEXTS, Tracked, add_latest
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import (
-    TOO_SURE,
     Summary,
+    caveat_of,
     known_points,
     reference_in_map,
     summarised,
@@ -145,9 +145,9 @@ def _write(
     times = [result.time for result in history]
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
-    camera = tracker.camera()
-    caveat = TOO_SURE if camera is not None and camera[0] == "estimated" else ""
-    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
+    write_covariances(
+        out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat_of(tracker)
+    )
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:
         assert source.reference is not None

@@ -20,8 +20,9 @@ GUESSED = from_field_of_view(640, 480)
 @pytest.mark.parametrize(
     ("name", "calibration", "kind", "sigma"),
     [
-        (None, PLAIN, Known, ()),
-        (None, STATED, Known, ()),
+        (None, PLAIN, Estimated, (0.7, 0.7, 0.6, 0.6)),
+        (None, STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
+        ("known", STATED, Known, ()),
         (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
         ("known", GUESSED, Known, ()),
         ("estimated", STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
@@ -29,7 +30,7 @@ GUESSED = from_field_of_view(640, 480)
         ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
     ],
 )
-def test_a_guess_is_estimated_and_stated_sigmas_are_used(name, calibration, kind, sigma):
+def test_a_calibration_is_estimated_and_stated_sigmas_are_used(name, calibration, kind, sigma):
     settings = TrackerSettings(filter="world", calibration=name, focal_sigma=0.7, centre_sigma=0.6)
     treatment = settings.treatment(calibration)
     assert type(treatment) is kind
@@ -82,8 +83,14 @@ def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
     assert "caveat" not in told
 
 
+def test_a_calibration_without_sigma_is_known_to_three_per_thousand():
+    treatment = TrackerSettings(filter="world").treatment(PLAIN)
+    np.testing.assert_allclose(treatment.sigma, [1.5, 1.5, 0.96, 0.96])
+
+
 def test_a_known_camera_is_reported_as_it_is():
-    tracker = Tracker(PLAIN, TrackerSettings(filter="world", wanted=10))
+    settings = TrackerSettings(filter="world", wanted=10, calibration="known")
+    tracker = Tracker(PLAIN, settings)
     camera = tracker.camera()
     assert camera is not None
     assert camera[0] == "known"

@@ -160,7 +160,8 @@ def test_what_was_estimated_of_a_lens_is_told_by_name_with_its_sigma():
     lens = summary._lens(guessed)
     assert list(lens) == ["fx", "fy", "cx", "cy", "k1", "k2"]
     assert lens["k1"] == {"value": 0.0, "sigma": pytest.approx(0.15)}
-    assert summary._lens(Tracker(small(1).calibration, SETTINGS)) == {}
+    known = replace(SETTINGS, calibration="known")
+    assert summary._lens(Tracker(small(1).calibration, known)) == {}
 
 
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):

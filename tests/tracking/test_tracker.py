@@ -482,7 +482,7 @@ def test_a_camera_whose_direction_is_unknown_is_found_again(sigma):
 def test_an_unknown_calibration_counts_in_the_first_frame_too():
     """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
     source = synthetic_source(frames=1)
-    settings = replace(SMALL, calibration="white", centre_sigma=2.0)
+    settings = replace(SMALL, calibration="white", focal_sigma=1.0, centre_sigma=2.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
         tracker.track(frame)
@@ -493,7 +493,7 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
         slam, tracker.map.state, slots, slam.sensor
     )
     # u = f x/z + c, each of f, c and u with its own σ.
-    variance = 0.3**2 + 2.0**2 + (settings.focal_sigma * np.asarray(charts)[:, 0]) ** 2
+    variance = 0.3**2 + 2.0**2 + np.asarray(charts)[:, 0] ** 2
     expected = variance / source.calibration.fx**2
     np.testing.assert_allclose(covariances[:, 0, 0], expected, rtol=1e-6, atol=0)
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.tracking.landmarks import Landmark
-from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.patches import Picture
+from jaxslam.tracking.pose_with_covariance import Places
 
 CORNERS = 600
 """The number of corners of a picture that are compared."""

@@ -18,11 +18,17 @@ from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.relocalisation import known_again, well_known
 from jaxslam.tracking.places.submaps import Submap, in_submaps
 from jaxslam.tracking.policy import Policy
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint, positive
+from jaxslam.tracking.pose_with_covariance import (
+    Places,
+    PoseWithCovariance,
+    Transform,
+    adjoint,
+    positive,
+)
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.unit import Join
 
