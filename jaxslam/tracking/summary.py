@@ -268,7 +268,7 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -
 
 
 def caveat_of(tracker: Tracker) -> str:
-    """The caveat on a lens of which nobody knew much."""
+    """The caveat on a lens of which little was known."""
     camera = tracker.camera()
     estimated = camera is not None and camera[0] == "estimated"
     return TOO_SURE if estimated and tracker.calibration.guessed else ""
