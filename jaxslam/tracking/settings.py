@@ -137,10 +137,11 @@ class TrackerSettings:
 
     def treatment(self, calibration: Calibration) -> AbstractCalibration:
         """Return what the filter makes of a calibration, with the σ that it states or else with
-        these."""
+        these: then both focal lengths are off by the same."""
         c = calibration
         name = self.calibration or "estimated"
         focal = self.focal_sigma or UNSTATED * max(c.fx, c.fy)
         centre = self.centre_sigma or UNSTATED * c.width / 2
-        sigma = list(c.sigma) or [focal, focal, centre, centre]
-        return TREATMENTS[name]([*sigma[1:], *LENS_SIGMA] if c.guessed else sigma)
+        if c.guessed:
+            return TREATMENTS[name]([*c.sigma[1:], *LENS_SIGMA])
+        return TREATMENTS[name](list(c.sigma) or [focal, centre, centre])
