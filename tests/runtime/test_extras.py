@@ -61,7 +61,7 @@ def test_a_bar_without_tqdm_names_the_cli_extra(monkeypatch):
 def test_the_core_brings_mathematics_and_figures_alone():
     core = tomllib.loads(PROJECT.read_text())["project"]["dependencies"]
     assert {name.partition(">")[0] for name in core} <= {
-        "equinox", "jax", "jaxlie", "jaxtyping", "matplotlib", "numpy", "scipy",
+        "equinox", "jax", "jaxlie", "jaxtyping", "matplotlib", "numpy", "optimistix", "scipy",
     }  # fmt: skip
 
 
