@@ -36,7 +36,7 @@ REFERENCES = {
 }
 """σ of references that are not exact: of position in their unit, and of orientation, degrees, as
 their own descriptions state. KITTI states less for its orientations, but epipolar lines of optical
-flow put those of these 51 frames off by .4 to .8° over eight (docs/belief.md)."""
+flow put those of these 51 frames off by .4 to .8° over eight (docs/sequences.md)."""
 UNSTATED = ("slider_depth",)
 """Sequences whose reference has a σ that nobody states: no covariance is tested with those."""
 MARK = "<!-- sequences.py, in words -->"
