@@ -45,7 +45,7 @@ class TrackerSettings:
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str | None = None
     """The treatment of the calibration: a name of TREATMENTS. By default it is estimated, with the
-    σ that it states, that of a guess, or else `focal_sigma` and `centre_sigma`."""
+    σ that it states, that of a guess, or else 0.3 % of the focal length and 0.15 % of the width."""
     association: str = "sequential"
     """Which matches are believed: a name of jaxslam.filters.association.ASSOCIATIONS."""
     tolerance: float = TOLERANCE
@@ -65,10 +65,10 @@ class TrackerSettings:
     it is unknown in metres."""
     pixel_sigma: float = 0.3
     """σ of a match whose window fits, pixels; of the others it is larger (`noise_factors`)."""
-    focal_sigma: float | None = None
-    """σ of the focal lengths, pixels, of a calibration without one; by default 0.3 % of them."""
-    centre_sigma: float | None = None
-    """σ of the principal point, pixels, of the same; by default 0.15 % of the picture's width."""
+    focal_sigma: float = 1.0
+    """σ of the focal lengths, pixels, of a calibration that states none and is treated as named."""
+    centre_sigma: float = 1.0
+    """σ of the principal point, pixels, of the same."""
     velocity_sigma: float = 0.5
     """σ of the initial linear velocity, 1/s."""
     angular_velocity_sigma: float = 1.0
@@ -137,11 +137,12 @@ class TrackerSettings:
 
     def treatment(self, calibration: Calibration) -> AbstractCalibration:
         """Return what the filter makes of a calibration, with the σ that it states or else with
-        these: then both focal lengths are off by the same."""
-        c = calibration
-        name = self.calibration or "estimated"
-        focal = self.focal_sigma or UNSTATED * max(c.fx, c.fy)
-        centre = self.centre_sigma or UNSTATED * c.width / 2
+        these; where no treatment is named with `UNSTATED`, by which both focal lengths are off."""
+        c, named = calibration, self.calibration
         if c.guessed:
-            return TREATMENTS[name]([*c.sigma[1:], *LENS_SIGMA])
-        return TREATMENTS[name](list(c.sigma) or [focal, centre, centre])
+            sigma = [*c.sigma[1:], *LENS_SIGMA]
+        elif c.sigma or named:
+            sigma = list(c.sigma) or [self.focal_sigma] * 2 + [self.centre_sigma] * 2
+        else:
+            sigma = UNSTATED * np.array([max(c.fx, c.fy), c.width / 2, c.width / 2])
+        return TREATMENTS[named or "estimated"](sigma)

@@ -145,9 +145,8 @@ def _write(
     times = [result.time for result in history]
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
-    write_covariances(
-        out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat_of(tracker)
-    )
+    caveat = caveat_of(tracker)
+    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:
         assert source.reference is not None

@@ -20,13 +20,13 @@ GUESSED = from_field_of_view(640, 480)
 @pytest.mark.parametrize(
     ("name", "calibration", "kind", "sigma"),
     [
-        (None, PLAIN, Estimated, (0.7, 0.6, 0.6)),
+        (None, PLAIN, Estimated, (1.5, 0.96, 0.96)),
         (None, STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
         ("known", STATED, Known, ()),
         (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
         ("known", GUESSED, Known, ()),
         ("estimated", STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
-        ("white", PLAIN, White, (0.7, 0.6, 0.6)),
+        ("white", PLAIN, White, (0.7, 0.7, 0.6, 0.6)),
         ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
     ],
 )
@@ -81,11 +81,6 @@ def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
     assert (told["treatment"], told["estimated"]["fx"]) == ("consider", GUESSED.fx)
     assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
     assert "caveat" not in told
-
-
-def test_a_calibration_without_sigma_is_known_to_three_per_thousand():
-    treatment = TrackerSettings(filter="world").treatment(PLAIN)
-    np.testing.assert_allclose(treatment.sigma, [1.5, 0.96, 0.96])
 
 
 def test_a_known_camera_is_reported_as_it_is():
