@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.consistency.runs import run_through
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.models.observations import Innovation
 from jaxslam.simulation import Room, Run
 
 
@@ -22,10 +23,10 @@ def log_likelihood(slam: AbstractFilter, room: Room, run: Run) -> Float[Array, "
 
     The constant is the same for all filters that use the same measurements.
     """
+    return -jnp.sum(run_through(slam, room, run, lambda _, seen, __: cost_of(seen))[1])
 
-    def term(state, innovation, frame):
-        del state, frame
-        assert innovation.log_det is not None, "a likelihood needs the determinant of S"
-        return -(innovation.nis + innovation.log_det) / 2
 
-    return jnp.sum(run_through(slam, room, run, term)[1])
+def cost_of(innovation: Innovation) -> Float[Array, ""]:
+    """`½ (rᵀ S⁻¹ r + log det S)`: minus the log likelihood of a frame, up to a constant."""
+    assert innovation.log_det is not None, "a likelihood needs the determinant of S"
+    return (innovation.nis + innovation.log_det) / 2

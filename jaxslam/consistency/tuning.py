@@ -23,10 +23,11 @@ from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, cast, is_number
 from jaxslam._runtime.lookup import lookup
+from jaxslam.consistency.likelihood import cost_of
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import whitened_innovation
 from jaxslam.filters.run import Frames, MeasuredRun, run
-from jaxslam.models.observations import Capacity, Features
+from jaxslam.models.observations import Capacity, Features, Innovation
 from jaxslam.statistics.bands import normalised_squared, whiteness_p_value
 
 NOISE = ("motion.noise_sigma", "sensor.sigma")
@@ -186,15 +187,13 @@ def tune(
     slam, logs, held_out = cast(slam, dtype), cast(list(logs), dtype), cast(list(held_out), dtype)
     search = _Search.of(slam, names, bounds, priors, settings)
     groups = _grouped(logs)
-    before = fit_of(slam, logs)
+    before, sums = _fit_and_sums(slam, logs)
     if not math.isfinite(before.log_likelihood):
         raise ValueError(
             "the filter diverges in these logs with the numbers that it starts with; start from "
             "larger σ"
         )
-    theta, converged, hessian = _minimised(
-        search, groups, *_outliers(slam, logs, settings), settings
-    )
+    theta, converged, hessian = _minimised(search, groups, *_outliers(sums, settings), settings)
     tuned, found = search.filter_of(theta), search.values(theta)
     spread = search.sigmas(theta, hessian)
     aside = (fit_of(slam, held_out), fit_of(tuned, held_out)) if held_out else None
@@ -363,20 +362,19 @@ class _Records(NamedTuple):
     """Numbers that were measured and not used."""
 
 
-def _records(slam: AbstractFilter, state, innovation, frame) -> _Records:
-    assert innovation.log_det is not None, "a likelihood needs the determinant of S"
+def _records(innovation: Innovation, frame) -> _Records:
     dof = innovation.nis_dof.astype(innovation.nis.dtype)
     valid = frame.seen.valid.sum() * innovation.residual.shape[-1]
-    cost = (innovation.nis + innovation.log_det) / 2
-    return _Records(cost, innovation.log_det, innovation.nis, dof, valid - dof)
+    cost, nis = cost_of(innovation), innovation.nis
+    return _Records(cost, 2 * cost - nis, nis, dof, valid - dof)
 
 
 def _cost(slam: AbstractFilter, group: MeasuredRun, outlier: Float[Array, ""]) -> Float[Array, ""]:
     """Minus the log likelihood of a batch of logs; `outlier` is the cost of what is left out."""
 
     def of(log: MeasuredRun) -> Float[Array, ""]:
-        def output(*step):
-            found = _records(slam, *step)
+        def output(_, innovation, frame):
+            found = _records(innovation, frame)
             return found.cost + outlier * found.left_out
 
         return jnp.sum(run(slam, log.frames, log.start(slam), output)[1])
@@ -384,16 +382,12 @@ def _cost(slam: AbstractFilter, group: MeasuredRun, outlier: Float[Array, ""]) -
     return jnp.sum(jax.vmap(of)(group))
 
 
-def _outliers(slam, logs, settings: TuningSettings) -> tuple[Float[Array, ""], float]:
+def _outliers(total: _Records, settings: TuningSettings) -> tuple[Float[Array, ""], float]:
     """The cost of one number that is left out, and the count of all that were measured."""
-    log_det = dof = count = 0.0
-    for log in logs:
-        found = _run_records(slam, log)[0]
-        log_det, dof = log_det + np.sum(found.log_det), dof + np.sum(found.dof)
-        count += np.sum(found.dof + found.left_out)
-    if not dof:
+    if not total.dof:
         raise ValueError("no measurement of these logs is used: there is no innovation")
-    return jnp.asarray((settings.outlier**2 + log_det / dof) / 2), float(count)
+    cost = (settings.outlier**2 + total.log_det / total.dof) / 2
+    return jnp.asarray(cost), float(total.dof + total.left_out)
 
 
 def _minimised(
@@ -458,7 +452,7 @@ def _run_records(slam: AbstractFilter, log: MeasuredRun) -> tuple[_Records, _OfF
             none = jnp.full((log.capacity.landmarks, white.shape[1]), jnp.nan)
             place = jnp.where(innovation.used, frame.seen.slots, len(none))
             white = none.at[place].set(white, mode="drop")
-        return (*_records(slam, state, innovation, frame), white, state)
+        return (*_records(innovation, frame), white, state)
 
     *found, white, states = run(slam, log.frames, log.start(slam), output)[1]
     nees = None
@@ -469,23 +463,28 @@ def _run_records(slam: AbstractFilter, log: MeasuredRun) -> tuple[_Records, _OfF
 
 def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> LogFit:
     """Return how well a filter fits logs, which may be of any length."""
+    return _fit_and_sums(slam, logs)[0]
+
+
+def _fit_and_sums(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> tuple[LogFit, _Records]:
+    """How well it does, and the sums of the records of all frames."""
     runs = [_run_records(slam, log) for log in logs]
-    sums = np.sum([[np.sum(part) for part in records] for records, _ in runs], axis=0)
-    total = dict(zip(_Records._fields, sums.tolist(), strict=True))
+    total = _Records(*np.sum([[np.sum(part) for part in found] for found, _ in runs], axis=0))
     nees = [np.asarray(of.nees) for _, of in runs if of.nees is not None]
     degrees = [log.truth.tangent_dim for log in logs if log.truth is not None]
     correlation = mean = p = None
     if all(of.white is not None for _, of in runs):
         correlation, mean, p = _whiteness([np.asarray(of.white) for _, of in runs])
-    return LogFit(
-        log_likelihood=-total["cost"],
-        nis=total["nis"] / total["dof"] if total["dof"] else math.nan,
+    fit = LogFit(
+        log_likelihood=-float(total.cost),
+        nis=float(total.nis / total.dof) if total.dof else math.nan,
         nees=float(np.mean(np.concatenate(nees))) / degrees[0] if nees else None,
         correlation=correlation,
         mean=mean,
         p=p,
-        left_out=total["left_out"] / max(total["dof"] + total["left_out"], 1),
+        left_out=float(total.left_out / max(total.dof + total.left_out, 1)),
     )
+    return fit, total
 
 
 def _whiteness(white: list[np.ndarray]) -> tuple[float | None, float | None, float | None]:
