@@ -117,8 +117,8 @@ class AbstractBent(AbstractLens):
         return jax.jvp(self.bent, (flat,), (flat,))[1] @ flat >= 0
 
 
-class RadialTangential(AbstractBent):
-    """OpenCV's five numbers, ROS's `plumb_bob`, Kalibr's `radtan` (Brown, 1966)."""
+class AbstractTangential(AbstractBent):
+    """A lens with a radial part and the tangential one of Brown (1966)."""
 
     p1: Float[AnyArray, ""] = number_field(default=0.0)
     """A coefficient of the tangential part."""
@@ -126,23 +126,31 @@ class RadialTangential(AbstractBent):
     """A coefficient of the tangential part."""
     k3: Float[AnyArray, ""] = number_field(default=0.0)
     """The coefficient of r⁶."""
+
+    @abstractmethod
+    def radial(self, r2: Scalar) -> Scalar:
+        """By what a place at the distance r of the axis is farther out."""
+
+    def polynomial(self, r2: Scalar) -> Scalar:
+        """`1 + k1 r² + k2 r⁴ + k3 r⁶`."""
+        return 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
 
     def bent(self, flat: Place) -> Place:
-        """`x (1 + k1 r² + k2 r⁴ + k3 r⁶ + 2 s·x) + s r²` with s = (p2, p1)."""
-        r2 = flat @ flat
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        return _with_tangential(flat, radial, self.p1, self.p2)
+        """`x (radial + 2 s·x) + s r²` with s = (p2, p1)."""
+        r2, swapped = flat @ flat, jnp.stack([self.p2, self.p1])
+        return flat * (self.radial(r2) + 2 * swapped @ flat) + r2 * swapped
 
 
-class Rational(AbstractBent):
+class RadialTangential(AbstractTangential):
+    """OpenCV's five numbers, ROS's `plumb_bob`, Kalibr's `radtan` (Brown, 1966)."""
+
+    def radial(self, r2: Scalar) -> Scalar:
+        return self.polynomial(r2)
+
+
+class Rational(AbstractTangential):
     """OpenCV's eight numbers, ROS's `rational_polynomial`, for wide lenses."""
 
-    p1: Float[AnyArray, ""] = number_field(default=0.0)
-    """A coefficient of the tangential part."""
-    p2: Float[AnyArray, ""] = number_field(default=0.0)
-    """A coefficient of the tangential part."""
-    k3: Float[AnyArray, ""] = number_field(default=0.0)
-    """The coefficient of r⁶."""
     k4: Float[AnyArray, ""] = number_field(default=0.0)
     """The coefficient of r² in the denominator."""
     k5: Float[AnyArray, ""] = number_field(default=0.0)
@@ -150,12 +158,9 @@ class Rational(AbstractBent):
     k6: Float[AnyArray, ""] = number_field(default=0.0)
     """The coefficient of r⁶ in the denominator."""
 
-    def bent(self, flat: Place) -> Place:
-        """As `RadialTangential`, its polynomial divided by `1 + k4 r² + k5 r⁴ + k6 r⁶`."""
-        r2 = flat @ flat
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        radial = radial / (1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)))
-        return _with_tangential(flat, radial, self.p1, self.p2)
+    def radial(self, r2: Scalar) -> Scalar:
+        """The polynomial divided by `1 + k4 r² + k5 r⁴ + k6 r⁶`."""
+        return self.polynomial(r2) / (1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)))
 
 
 class Fisheye(AbstractBent):
@@ -204,11 +209,6 @@ LENSES: dict[str, type[AbstractLens]] = {
     "fisheye": Fisheye,
 }
 """Lenses by the `model` of a calibration file."""
-
-
-def _with_tangential(flat: Place, radial: Scalar, p1: Number, p2: Number) -> Place:
-    swapped = jnp.stack([p2, p1])
-    return flat * (radial + 2 * swapped @ flat) + flat @ flat * swapped
 
 
 @jax.custom_jvp
