@@ -68,7 +68,7 @@ def of_simulation(room: Room, run: Run) -> MeasuredRun:
     first, seen, new = features(run, room)
     poses, points = jax.tree.map(lambda x: x[1:], (run.poses, run.points_by_frame))
     frames = SimulatedFrame(run.controls, seen, new, gone(run, room), poses, points)
-    return MeasuredRun(frames, room.capacity, first, run.known, poses)
+    return MeasuredRun(frames, room.capacity, first, run.known, poses, run.motion)
 
 
 def filter_run(

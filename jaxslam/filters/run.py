@@ -16,7 +16,7 @@ from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.protocol import AbstractFilter, Belief
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose
-from jaxslam.models.motion import Control
+from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap
 
 
@@ -95,10 +95,17 @@ class MeasuredRun(eqx.Module):
     """The landmarks that are known before it."""
     truth: Pose | None = None
     """T_BC of the frames after frame 0, where it is known."""
+    motion: AbstractMotion | None = None
+    """The motion model with what is known of this run's start; None where that is the filter's."""
 
     def start(self, slam: AbstractFilter) -> Belief:
-        """The state of a filter after frame 0."""
+        """The state of a filter after frame 0. Raises ValueError for a filter without a motion,
+        where a run has a start of its own."""
         known = {} if self.known is None else {"known": self.known}
+        if self.motion is not None:
+            if not hasattr(slam, "motion"):
+                raise ValueError(f"{type(slam).__name__} has no motion: it cannot begin as told")
+            slam = replace(slam, motion=self.motion)  # ty: ignore[invalid-argument-type]
         return slam.init(self.capacity, self.first, **known)
 
 

@@ -10,6 +10,8 @@ space. A cart that drives ahead at v and turns left at ω has the velocity (0, v
 x ahead and y left, as ROS does, a planar velocity (vx, vy, ω) is (−vy, vx, ω) here.
 """
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
 
@@ -76,6 +78,14 @@ class AbstractMotion(eqx.Module):
         the reading, and the truth moves by the control exactly; of others it moves the truth."""
         del noise
         return control
+
+    def along(
+        self, path: Pose, seconds: Scalar, down: Float[Array, " n"], key: Array
+    ) -> tuple[Pose, Control, AbstractMotion]:
+        """What a simulation draws along a path of T_WC that are `seconds` apart: the true poses of
+        frames, the control of every step, and the model with this run's start. Only of a model
+        that says so; `down` is the direction of gravity in W."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how it is read along a path")
 
     def enlarged(
         self, variables: Variables, noise: Float[Array, " q"], factor: Scalar

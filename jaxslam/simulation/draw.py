@@ -9,20 +9,24 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.geometry import Pose, identity, retract
+from jaxslam.geometry import Pose, exp, identity, retract
 from jaxslam.linalg import semidefinite_root
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import PriorMap
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation.run import Run, in_order_of_appearance, in_shared_slots
 from jaxslam.simulation.scenario import as_scenario
-from jaxslam.simulation.trajectories import RecordedMotion, find, sampled
+from jaxslam.simulation.trajectories import RecordedMotion, find, from_first, sampled
 from jaxslam.simulation.visibility import limited
 from jaxslam.simulation.world import NominalCalibration, World
+
+SWAY = np.array([0.31, 0.23, 0.27, 0.37, 0.41, 0.19])
+"""Hz, at which each number of a velocity sways."""
 
 
 def as_data(world: World, dtype: DTypeLike | None = None) -> World:
@@ -76,7 +80,7 @@ def simulate(
     """
     world = as_data(with_own(scenario, motion, sensor), dtype)
     motion_key, world_key, camera_key, pixel_key = jax.random.split(_as_key(key), 4)
-    poses, controls = _path(world, motion_key)
+    poses, controls, told = (_read_path if world.inertial else _path)(world, motion_key)
     sensors = world.calibration.sensors(world.sensor, camera_key, world.steps + 1)
     points, new = world.placement.along(world, world_key, poses, sensors)
     every = jax.vmap(world.measured, in_axes=(0, 0, None if new is None else 0))
@@ -89,7 +93,7 @@ def simulate(
     drift_key, beacon_key = (jax.random.fold_in(pixel_key, i) for i in (2, 3))
     if world.drift is not None:
         errors += world.drift.errors(drift_key, measured)
-    run = Run(poses, points, measured + errors, seen, controls, sensors, new)
+    run = Run(poses, points, measured + errors, seen, controls, sensors, new, motion=told)
     if world.limits.in_view:
         return in_shared_slots(run, world.limits.in_view)
     if new is not None:
@@ -139,10 +143,42 @@ def trajectory_of(world: World) -> RecordedMotion | None:
     if not isinstance(world.trajectory, str):
         return world.trajectory
     moving = world.steps - min(world.still_frames, world.steps)
-    return sampled(find(world.trajectory), float(world.rate), moving)
+    of_step = world.motion.readings if world.inertial else 1
+    return sampled(find(world.trajectory), float(world.rate) * of_step, moving * of_step)
 
 
-def _path(world: World, key: Array) -> tuple[Pose, Control]:
+def _read_path(world: World, key: Array) -> tuple[Pose, Control, AbstractMotion]:
+    """The true poses, what the filter is given at every step, and its motion with this run's start:
+    of a motion that is read many times a step."""
+    motion = world.motion
+    path_key, key = jax.random.split(key)
+    seconds = 1 / (world.rate * motion.readings)
+    if isinstance(world.trajectory, RecordedMotion):
+        path, down = world.trajectory.piece(path_key), -jnp.eye(3, dtype=seconds.dtype)[2]
+    else:
+        path, down = _swaying(world, path_key, seconds), motion.mount.rotation() @ motion.down
+    poses, controls, told = motion.along(path, seconds, down, key)
+    return from_first(poses), controls, told
+
+
+def _swaying(world: World, key: Array, seconds: Array) -> Pose:
+    """A path at the nominal velocity, and what it sways by, from rest in frames that stand still."""
+    count = world.steps * world.motion.readings
+    time = (jnp.arange(count, dtype=seconds.dtype) + 0.5)[:, None] * seconds
+    phase = jax.random.uniform(key, (6,), time.dtype, maxval=2 * jnp.pi)
+    velocity = world.velocity + world.sway * jnp.sin(2 * jnp.pi * SWAY * time + phase)
+    started = jnp.clip(time - world.still_frames / world.rate, 0.0, 1.0)
+    started = started**2 * (3 - 2 * started) if world.still_frames else jnp.ones_like(time)
+    group, origin = world.geometry.group, identity(world.geometry, time.dtype)
+
+    def move(pose, velocity):
+        pose = (pose @ exp(group, velocity * seconds)).normalize()
+        return pose, pose
+
+    return _with_start(origin, jax.lax.scan(move, origin, started * velocity)[1])
+
+
+def _path(world: World, key: Array) -> tuple[Pose, Control, None]:
     """The true poses, and what the filter is given at every step.
 
     In frames in which the camera stands still, neither pose nor variables move.
@@ -156,7 +192,7 @@ def _path(world: World, key: Array) -> tuple[Pose, Control]:
         if world.trajectory.steps != moving:
             raise ValueError(f"a trajectory for {world.trajectory.steps} steps, not {moving}")
         poses = jax.tree.map(lambda x: x[1:], world.trajectory.run(key))
-        return _with_start(origin, poses, still), every
+        return _with_start(origin, poses, still), every, None
     # Of a reading all of the noise, as of a motion the start too, from the filter's prior (P8, P9).
     start_key, noise_key = (
         (jax.random.fold_in(key, 1), key) if world.reads else jax.random.split(key)
@@ -177,7 +213,7 @@ def _path(world: World, key: Array) -> tuple[Pose, Control]:
     _, poses = jax.lax.scan(move, (origin, start), moved)
     if world.reads:
         every = jax.vmap(motion.reading, in_axes=(None, 0))(control, noises)
-    return _with_start(origin, poses, still), every
+    return _with_start(origin, poses, still), every, None
 
 
 def _with_start(start: Pose, poses: Pose, still: int = 0) -> Pose:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.geometry import Pose
-from jaxslam.models.motion import Control
+from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Capacity, Features, PriorMap
 from jaxslam.models.sensors import AbstractSensor
 
@@ -42,6 +42,8 @@ class Run(eqx.Module):
     """Which point each slot stands for, where one that comes back is a new landmark."""
     known: PriorMap | None = None
     """What is known of landmarks before frame 0: of surveyed beacons."""
+    motion: AbstractMotion | None = None
+    """The motion model with what is known of this run's start; None where all have the same."""
 
     @property
     def beacons(self) -> Bool[Array, " landmarks"]:

@@ -36,12 +36,20 @@ class RecordedMotion(eqx.Module):
     """Poses from which on `steps` others follow without a gap."""
     steps: int = eqx.field(static=True)
 
-    def run(self, key: Array) -> Pose:
-        """`T_C0,Ck` of frames 0 to `steps`, from a start drawn at random."""
+    def piece(self, key: Array) -> Pose:
+        """T_WC of frames 0 to `steps`, from a start drawn at random."""
         start = jnp.asarray(self.starts)[jax.random.randint(key, (), 0, self.starts.size)]
-        T_WC = jaxlie.SE3(jnp.asarray(self.poses)[start + jnp.arange(self.steps + 1)])
-        origin = jaxlie.SE3(T_WC.wxyz_xyz[0]).inverse()
-        return jax.vmap(lambda T: (origin @ T).normalize())(T_WC)
+        return jaxlie.SE3(jnp.asarray(self.poses)[start + jnp.arange(self.steps + 1)])
+
+    def run(self, key: Array) -> Pose:
+        """`T_C0,Ck` of the same frames."""
+        return from_first(self.piece(key))
+
+
+def from_first(T_WC: Pose) -> Pose:
+    """`T_C0,Ck` of poses T_WC."""
+    origin = jax.tree.map(lambda x: x[0], T_WC).inverse()
+    return jax.vmap(lambda T: (origin @ T).normalize())(T_WC)
 
 
 def find(trajectory: str) -> Path:

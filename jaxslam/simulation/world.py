@@ -34,6 +34,7 @@ from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import SPATIAL, Geometry, Pose
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.imu import Imu
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.sensors import AbstractSensor, FieldOfView, Pinhole, Position, RangeBearing
 from jaxslam.simulation.fields import FIELDS, PLACES, Value, check_signs
@@ -43,7 +44,7 @@ from jaxslam.simulation.trajectories import RecordedMotion
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOTIONS = {"velocity": ConstantVelocity, "odometry": Odometry}
+MOTIONS = {"velocity": ConstantVelocity, "odometry": Odometry, "imu": Imu}
 SENSORS = {"camera": Pinhole, "position": Position, "range_bearing": RangeBearing}
 
 
@@ -220,7 +221,10 @@ class World(eqx.Module):
     - `steps`: steps of a run after frame 0; `rate`: frames per second;
     - `velocity`: the nominal one in the camera's axes, m/s and rad/s; by default the motion's mean
       or, for a motion without one, 1.2 m/s ahead in a circle of 4 m;
-    - `trajectory`: a recorded path, or the name of its file; `still_frames`: steps in which the
+    - `sway`: what each number of that velocity sways by about it, of a motion that is read along a
+      path (`Imu`);
+    - `trajectory`: a recorded path, or the name of its file, which an `Imu` takes to be in a world
+      whose z points up; `still_frames`: steps in which the
       camera is first at rest;
     - `view`: what the sensor sees (least depth and distances, m; picture, pixels); `limits`: how
       much of that is measured;
@@ -242,6 +246,7 @@ class World(eqx.Module):
     steps: int = eqx.field(static=True, default=100)
     rate: Number = 10.0
     velocity: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
+    sway: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
     trajectory: str | RecordedMotion | None = None
     still_frames: int = count(0)
     view: FieldOfView = eqx.field(default=None)
@@ -261,11 +266,18 @@ class World(eqx.Module):
             ahead = {3: (0.0, 1.2, 0.3), 6: (0.0, 0.0, 1.2, 0.0, -0.3, 0.0)}
             known = self.motion.start()[0] if self.motion.has_velocity else None
             self.velocity = numbers(ahead[self.geometry.tangent_dim] if known is None else known)
+        if self.sway is None or not np.size(self.sway):
+            self.sway = numbers((0.0,) * self.geometry.tangent_dim)
 
     def __check_init__(self) -> None:
         check_signs(self, "world")
         geometry, sensor = self.geometry, type(self.sensor).__name__
         check_shape("the velocity of a world", self.velocity, (geometry.tangent_dim,))
+        check_shape("the sway of a world", self.sway, (geometry.tangent_dim,))
+        if isinstance(self.sway, np.ndarray) and self.sway.any() and not self.inertial:
+            raise ValueError(f"sway: not of a {type(self.motion).__name__}; use 0")
+        if self.inertial and self.still_frames and self.trajectory:
+            raise ValueError("still_frames: not with an Imu along a trajectory; use 0")
         if self.sensor.point_dim != geometry.point_dim:
             raise ValueError(
                 f"the sensor {sensor} is not for a {geometry.name} world, in which "
@@ -301,6 +313,11 @@ class World(eqx.Module):
     def reads(self) -> bool:
         """Whether the truth is the nominal motion, which filters are given as it is read."""
         return type(self.motion).reading is not AbstractMotion.reading
+
+    @property
+    def inertial(self) -> bool:
+        """Whether the motion is read many times a step along a path, which is the truth."""
+        return type(self.motion).along is not AbstractMotion.along
 
     @property
     def scale_free(self) -> bool:

@@ -1,0 +1,305 @@
+"""An inertial unit as a motion model: any number of readings between two frames, metres, gravity.
+
+The readings are angular velocities ω, rad/s, and specific forces f, m/s², in the unit's axes I,
+each with a bias b and white noise n of a density that data sheets have:
+
+    Ṙ = R [ω − b_g − n_g]×,    v̇ = R (f − b_a − n_a) + g,    ṗ = v.
+
+All readings of a step are integrated once, before any filter, to `Increments`, whose change by the
+biases is kept to first order (Lupton, Sukkarieh, T-RO 2012; Forster et al., T-RO 2017): a filter's
+step costs the same however many they are. Nothing is said about the world: gravity is a direction
+in the unit's axes that turns with it, as in a robocentric filter (Huai, Huang, IROS 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, identity, joined, log
+from jaxslam.models.motion import AbstractMotion
+
+Vector = Float[Array, " 3"]
+_WHITE = 12
+"""Numbers of white noise in a step: the mean and the slope of each axis of both sensors."""
+
+
+class Increments(eqx.Module):
+    """The readings of one step, integrated without gravity and without the velocity before it."""
+
+    seconds: Scalar
+    """T, the length of the step."""
+    turned: jaxlie.SO3
+    """ΔR, the rotation of the unit."""
+    sped: Vector
+    """Δv = ∫ R f dt, m/s, in the axes of the unit before the step."""
+    moved: Vector
+    """Δp = ∫∫ R f dt², m, in the same axes."""
+    bias: Float[Array, " 6"]
+    """Biases of gyroscope and accelerometer at which the readings were integrated."""
+    by_bias: Float[Array, "9 6"]
+    """Derivative of (Log ΔR, Δv, Δp), on the right of ΔR, by the biases."""
+    by_noise: Float[Array, "9 12"]
+    """The same by the white noise, of unit density."""
+
+
+class InertialState(eqx.Module):
+    """What an inertial unit keeps in a filter's state, in the unit's own axes."""
+
+    velocity: Vector
+    """m/s."""
+    gyroscope_bias: Vector
+    """rad/s."""
+    accelerometer_bias: Vector
+    """m/s²."""
+    down: Vector
+    """The direction of gravity; its length means nothing, as that of a homogeneous point."""
+
+    @property
+    def bias(self) -> Float[Array, " 6"]:
+        return jnp.concatenate([self.gyroscope_bias, self.accelerometer_bias])
+
+
+def increments(
+    seconds: Float[AnyArray, " m"],
+    gyroscope: Float[AnyArray, "m 3"],
+    accelerometer: Float[AnyArray, "m 3"],
+    bias: Float[AnyArray, " 6"] | None = None,
+) -> Increments:
+    """Return the increments of readings that hold for so many seconds each: the control of `Imu`.
+
+    A reading of no seconds is none. `bias` is where they are linearised, near the biases expected.
+
+    Within a reading the specific force is turned by half the reading's rotation. The noise of one
+    axis is white; of its course in a step the mean and the slope are kept, two orthonormal
+    polynomials: they give the covariances of ΔR and Δv, and of Δp but for what the gyroscope's
+    noise does in third order.
+    """
+    seconds, gyroscope, accelerometer = map(jnp.asarray, (seconds, gyroscope, accelerometer))
+    bias = jnp.zeros(6, seconds.dtype) if bias is None else jnp.asarray(bias)
+    mean, slope = _two_polynomials(seconds)
+    readings = seconds, jnp.concatenate([gyroscope, accelerometer], axis=1) - bias, mean, slope
+
+    def integrated(off: Float[Array, " 18"]) -> tuple[jaxlie.SO3, Vector, Vector]:
+        off_bias, of_mean, of_slope = off[:6], off[6:12], off[12:]
+
+        def one(carry, reading):
+            turned, sped, moved = carry
+            h, rates, mean, slope = reading
+            rates = rates - off_bias - mean * of_mean - slope * of_slope
+            half = exp(jaxlie.SO3, rates[:3] * h / 2)
+            gain = turned @ half @ rates[3:] * h
+            moved = moved + sped * h + gain * h / 2
+            return ((turned @ half @ half).normalize(), sped + gain, moved), None
+
+        none = jnp.zeros(3, off.dtype)
+        start = (jax.tree.map(lambda x: x.astype(off.dtype), jaxlie.SO3.identity()), none, none)
+        return jax.lax.scan(one, start, readings)[0]
+
+    zero = jnp.zeros(18, seconds.dtype)
+    turned, sped, moved = integrated(zero)
+
+    def change(off):
+        to, by, at = integrated(off)
+        return jnp.concatenate([log(turned.inverse() @ to), by, at])
+
+    J = jax.jacfwd(change)(zero)
+    return Increments(jnp.sum(seconds), turned, sped, moved, bias, J[:, :6], J[:, 6:])
+
+
+def _two_polynomials(
+    seconds: Float[Array, " m"],
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Orthonormal functions of time of degree 0 and 1: `∫ φ_i φ_j dt = δ_ij`."""
+    total = jnp.sum(seconds)
+    middle = jnp.cumsum(seconds) - seconds / 2 - total / 2
+    size = jnp.sum(seconds * middle**2)
+    mean = jnp.where(total > 0, 1 / jnp.sqrt(jnp.where(total > 0, total, 1.0)), 0.0)
+    slope = jnp.where(size > 0, 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
+    return jnp.full_like(seconds, mean), slope * middle
+
+
+class Imu(AbstractMotion):
+    """An inertial unit; the control is the `Increments` of a step.
+
+    Noises are densities, as data sheets and Kalibr's `imu.yaml` have them. What is known of the
+    start is in the unit's axes. Raises ValueError for shapes that are others.
+    """
+
+    density: Float[AnyArray, " 2"] = number_field()
+    """σ of the white noise of the gyroscope, rad/s/√Hz, and of the accelerometer, m/s²/√Hz."""
+    walk: Float[AnyArray, " 2"] = number_field(default=(0.0, 0.0))
+    """σ of the random walks of their biases, rad/s²/√Hz and m/s³/√Hz."""
+    bias: Float[AnyArray, " 6"] = number_field(default=(0.0,) * 6)
+    """Mean of the biases before the first step, rad/s and m/s²."""
+    bias_sigma: Float[AnyArray, " 2"] = number_field(default=(0.01, 0.1))
+    """σ of each of the gyroscope's, rad/s, and of the accelerometer's, m/s²."""
+    velocity: Float[AnyArray, " 3"] = number_field(default=(0.0, 0.0, 0.0))
+    """Mean of the velocity, m/s."""
+    down: Float[AnyArray, " 3"] = number_field(default=(0.0, 1.0, 0.0))
+    """Mean of the direction of gravity, a unit vector: at rest the opposite of the force read."""
+    start_sigma: Float[AnyArray, " 2"] = number_field(default=(1.0, 0.1))
+    """σ of each number of the velocity, m/s, and of gravity's direction about each axis, rad."""
+    camera_from_imu: Float[AnyArray, "4 4"] = number_field(
+        default=tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
+    )
+    """T_CI, the pose of the unit in the camera."""
+    gravity: Number = number_field(default=9.81)
+    """m/s²."""
+    readings: int = eqx.field(static=True, default=40)
+    """Readings of a step that a simulation draws."""
+
+    def __check_init__(self) -> None:
+        twos = dict.fromkeys(("density", "walk", "bias_sigma", "start_sigma"), (2,))
+        shapes = twos | {"bias": (6,), "velocity": (3,), "down": (3,), "camera_from_imu": (4, 4)}
+        for name, shape in shapes.items():
+            check_shape(f"{name} of an Imu", getattr(self, name), shape)
+
+    @property
+    def geometry(self) -> Geometry:
+        return SPATIAL
+
+    @property
+    def mount(self) -> Pose:
+        """T_CI."""
+        return jaxlie.SE3.from_matrix(jnp.asarray(self.camera_from_imu))
+
+    @property
+    def noise_sigma(self) -> Float[Array, " 18"]:
+        white, walk = (jnp.repeat(jnp.asarray(x), 3) for x in (self.density, self.walk))
+        return jnp.concatenate([white, white, walk])
+
+    def start(self) -> tuple[InertialState, Float[Array, "12 12"]]:
+        bias, down = jnp.asarray(self.bias), jnp.asarray(self.down)
+        variables = InertialState(jnp.asarray(self.velocity), bias[:3], bias[3:], down)
+        of_velocity, of_down = self.start_sigma
+        sigma = jnp.repeat(jnp.stack([of_velocity, *self.bias_sigma]), 3)
+        across = (jnp.eye(3, dtype=down.dtype) - jnp.outer(down, down)) * of_down
+        return variables, jax.scipy.linalg.block_diag(jnp.diag(sigma), across)
+
+    def _moved(
+        self, variables: InertialState, noise: Float[Array, " 18"], control: Increments
+    ) -> tuple[jaxlie.SO3, Vector, Vector, Float[Array, " 6"]]:
+        """ΔR, Δv and Δp of the unit, in its axes before the step, and the change of the biases.
+
+        The biases are those of the middle of the step.
+        """
+        T = control.seconds
+        walked = noise[_WHITE:] * jnp.sqrt(jnp.where(T > 0, T, 1.0))
+        off = variables.bias + walked / 2 - control.bias
+        error = control.by_bias @ off + control.by_noise @ noise[:_WHITE]
+        pull = self.gravity * T * variables.down / jnp.linalg.norm(variables.down)
+        sped = control.sped + error[3:6] + pull
+        moved = control.moved + error[6:] + (variables.velocity + pull / 2) * T
+        return control.turned @ exp(jaxlie.SO3, error[:3]), sped, moved, walked
+
+    def displacement(
+        self, variables: InertialState, noise: Float[Array, " 18"], control: Increments
+    ) -> Pose:
+        """`T_{k-1,k} = T_CI (ΔR, v T + g T²/2 + Δp) T_CI⁻¹`."""
+        turned, _, moved, _ = self._moved(variables, noise, control)
+        return self.mount @ joined(turned, moved) @ self.mount.inverse()
+
+    def next(
+        self, variables: InertialState, noise: Float[Array, " 18"], control: Increments
+    ) -> InertialState:
+        """`v ← ΔRᵀ (v + g T + Δv)`, `g ← ΔRᵀ g`, and the biases a step of their walks further."""
+        turned, sped, _, walked = self._moved(variables, noise, control)
+        back, down = turned.inverse(), variables.down
+        return InertialState(
+            velocity=back @ (variables.velocity + sped),
+            gyroscope_bias=variables.gyroscope_bias + walked[:3],
+            accelerometer_bias=variables.accelerometer_bias + walked[3:],
+            down=back @ (down / jnp.linalg.norm(down)),
+        )
+
+    def still(self, dtype: DTypeLike | None = None) -> Increments:
+        dtype = dtype or jnp.result_type(float)
+
+        def zeros(*shape):
+            return jnp.zeros(shape, dtype)
+
+        turned = identity(SPATIAL, dtype).rotation()
+        return Increments(
+            zeros(), turned, zeros(3), zeros(3), zeros(6), zeros(9, 6), zeros(9, 12)
+        )
+
+    def along(
+        self, path: Pose, seconds: Scalar, down: Vector, key: Array
+    ) -> tuple[Pose, Increments, Imu]:
+        """Readings of a camera along a path of `steps · readings + 1` poses, `seconds` apart, in a
+        world where gravity points `down`.
+
+        Velocities are central differences. The poses that are returned, of every frame, are where
+        the readings without errors lead from the first, and the model has a start that is off by
+        its σ. Raises ValueError for fewer than three poses.
+        """
+        start_key, noise_key, walk_key = jax.random.split(key, 3)
+        unit = jax.vmap(lambda T_WC: T_WC @ self.mount)(path)
+        R, p = unit.rotation(), unit.translation()
+        v = jnp.gradient(p, axis=0) / seconds
+        turns = jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(*_neighbours(R)))
+        half = jax.vmap(lambda a, turn: a @ exp(jaxlie.SO3, turn / 2))(_neighbours(R)[0], turns)
+        pull = self.gravity * down
+        forces = jax.vmap(lambda R, a: R.inverse() @ (a - pull))(half, jnp.diff(v, axis=0) / seconds)
+        rates = jnp.concatenate([turns / seconds, forces], axis=1)
+
+        normal, root = partial(jax.random.normal, dtype=rates.dtype), jnp.sqrt(seconds)
+        told = self._told(v[0], R, down, start_key)
+        first_key, walk_key = jax.random.split(walk_key)
+        sigma, white = (jnp.repeat(jnp.asarray(x), 3) for x in (self.bias_sigma, self.density))
+        bias = jnp.asarray(self.bias) + sigma * normal(first_key, (6,))
+        walked = jnp.cumsum(normal(walk_key, rates.shape), axis=0) * self.noise_sigma[_WHITE:]
+        read = rates + bias + walked * root + white / root * normal(noise_key, rates.shape)
+
+        def each_step(rates, bias):
+            rates = rates.reshape(-1, self.readings, 6)
+            at = jnp.full(rates.shape[1], seconds)
+            return jax.vmap(lambda x: increments(at, x[:, :3], x[:, 3:], bias))(rates)
+
+        poses = self._through(each_step(rates, None), unit, v[0], down)
+        return poses, each_step(read, self.bias), told
+
+    def _told(self, velocity: Vector, R: jaxlie.SO3, down: Vector, key: Array) -> Imu:
+        """The model whose start is a true one and errors of its σ."""
+        errors = jax.random.normal(key, (2, 3), velocity.dtype)
+        R_IW = jax.tree.map(lambda x: x[0], R).inverse()
+        toward = R_IW @ down
+        off = exp(jaxlie.SO3, self.start_sigma[1] * _across(toward, errors[1]))
+        v = R_IW @ velocity + self.start_sigma[0] * errors[0]
+        return replace(self, velocity=v, down=off @ toward)
+
+    def _through(
+        self, controls: Increments, unit: Pose, velocity: Vector, down: Vector
+    ) -> Pose:
+        """The camera's pose in every frame, of readings without errors."""
+        start = jax.tree.map(lambda x: x[0], unit)
+        back, none = start.rotation().inverse(), jnp.zeros(3, velocity.dtype)
+        variables = InertialState(back @ velocity, none, none, back @ down)
+        noise = jnp.zeros(18, velocity.dtype)
+
+        def move(carry, control):
+            pose, variables = carry
+            pose = (pose @ self.displacement(variables, noise, control)).normalize()
+            return (pose, self.next(variables, noise, control)), pose
+
+        camera = start @ self.mount.inverse()
+        _, poses = jax.lax.scan(move, (camera, variables), controls)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), camera, poses)
+
+
+def _neighbours(batch):
+    return jax.tree.map(lambda x: x[:-1], batch), jax.tree.map(lambda x: x[1:], batch)
+
+
+def _across(direction: Vector, vector: Vector) -> Vector:
+    """The part of a vector that is across a direction."""
+    return vector - direction * (direction @ vector)
