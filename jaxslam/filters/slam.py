@@ -216,7 +216,10 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
         f"{update} is not for {frame.name} filters, whose unobservable directions are not known",
     )
     if slam.mixture is not None:
-        yield not moves, f"a mixture divides a velocity: {motion} has none"
+        yield (
+            not slam.motion.estimates_velocity,
+            f"a mixture divides a velocity: {motion} has none",
+        )
     if slam.start is not None:
         yield (
             slam.mixture is None or not slam.mixture.split,

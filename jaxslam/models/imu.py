@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,8 +24,8 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
-from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, identity, joined, log
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
+from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, identity, joined, log, retract
 from jaxslam.models.motion import AbstractMotion
 
 Vector = Float[Array, " 3"]
@@ -134,6 +135,8 @@ class Imu(AbstractMotion):
     start is in the unit's axes. Raises ValueError for shapes that are others.
     """
 
+    estimates_velocity: ClassVar[bool] = True
+
     density: Float[AnyArray, " 2"] = number_field()
     """σ of the white noise of the gyroscope, rad/s/√Hz, and of the accelerometer, m/s²/√Hz."""
     walk: Float[AnyArray, " 2"] = number_field(default=(0.0, 0.0))
@@ -148,6 +151,8 @@ class Imu(AbstractMotion):
     """Mean of the direction of gravity, a unit vector: at rest the opposite of the force read."""
     start_sigma: Float[AnyArray, " 2"] = number_field(default=(1.0, 0.1))
     """σ of each number of the velocity, m/s, and of gravity's direction about each axis, rad."""
+    root: Float[AnyArray, "12 12"] | None = eqx.field(default=None, converter=optional_numbers)
+    """R of the covariance `R Rᵀ` of velocity, biases and direction, in place of these σ."""
     camera_from_imu: Float[AnyArray, "4 4"] = number_field(
         default=tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
     )
@@ -180,10 +185,16 @@ class Imu(AbstractMotion):
     def start(self) -> tuple[InertialState, Float[Array, "12 12"]]:
         bias, down = jnp.asarray(self.bias), jnp.asarray(self.down)
         variables = InertialState(jnp.asarray(self.velocity), bias[:3], bias[3:], down)
+        if self.root is not None:
+            return variables, jnp.asarray(self.root)
         of_velocity, of_down = self.start_sigma
         sigma = jnp.repeat(jnp.stack([of_velocity, *self.bias_sigma]), 3)
         across = (jnp.eye(3, dtype=down.dtype) - jnp.outer(down, down)) * of_down
         return variables, jax.scipy.linalg.block_diag(jnp.diag(sigma), across)
+
+    def begun(self, variables: InertialState, root: Float[Array, "12 12"]) -> Imu:
+        v = variables
+        return replace(self, velocity=v.velocity, bias=v.bias, down=v.down, root=root)
 
     def _moved(
         self, variables: InertialState, noise: Float[Array, " 18"], control: Increments
@@ -228,9 +239,7 @@ class Imu(AbstractMotion):
             return jnp.zeros(shape, dtype)
 
         turned = identity(SPATIAL, dtype).rotation()
-        return Increments(
-            zeros(), turned, zeros(3), zeros(3), zeros(6), zeros(9, 6), zeros(9, 12)
-        )
+        return Increments(zeros(), turned, zeros(3), zeros(3), zeros(6), zeros(9, 6), zeros(9, 12))
 
     def along(
         self, path: Pose, seconds: Scalar, down: Vector, key: Array
@@ -249,57 +258,65 @@ class Imu(AbstractMotion):
         turns = jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(*_neighbours(R)))
         half = jax.vmap(lambda a, turn: a @ exp(jaxlie.SO3, turn / 2))(_neighbours(R)[0], turns)
         pull = self.gravity * down
-        forces = jax.vmap(lambda R, a: R.inverse() @ (a - pull))(half, jnp.diff(v, axis=0) / seconds)
+        forces = jax.vmap(lambda R, a: R.inverse() @ (a - pull))(
+            half, jnp.diff(v, axis=0) / seconds
+        )
         rates = jnp.concatenate([turns / seconds, forces], axis=1)
 
         normal, root = partial(jax.random.normal, dtype=rates.dtype), jnp.sqrt(seconds)
-        told = self._told(v[0], R, down, start_key)
-        first_key, walk_key = jax.random.split(walk_key)
-        sigma, white = (jnp.repeat(jnp.asarray(x), 3) for x in (self.bias_sigma, self.density))
-        bias = jnp.asarray(self.bias) + sigma * normal(first_key, (6,))
+        start, told = self._true_start(unit, v[0], down, start_key)
         walked = jnp.cumsum(normal(walk_key, rates.shape), axis=0) * self.noise_sigma[_WHITE:]
-        read = rates + bias + walked * root + white / root * normal(noise_key, rates.shape)
+        white = jnp.repeat(jnp.asarray(self.density), 3) / root
+        read = rates + start.bias + walked * root + white * normal(noise_key, rates.shape)
 
         def each_step(rates, bias):
             rates = rates.reshape(-1, self.readings, 6)
             at = jnp.full(rates.shape[1], seconds)
             return jax.vmap(lambda x: increments(at, x[:, :3], x[:, 3:], bias))(rates)
 
-        poses = self._through(each_step(rates, None), unit, v[0], down)
+        exact = replace(start, gyroscope_bias=jnp.zeros(3), accelerometer_bias=jnp.zeros(3))
+        poses = self._through(each_step(rates, None), path, exact)
         return poses, each_step(read, self.bias), told
 
-    def _told(self, velocity: Vector, R: jaxlie.SO3, down: Vector, key: Array) -> Imu:
-        """The model whose start is a true one and errors of its σ."""
-        errors = jax.random.normal(key, (2, 3), velocity.dtype)
-        R_IW = jax.tree.map(lambda x: x[0], R).inverse()
-        toward = R_IW @ down
-        off = exp(jaxlie.SO3, self.start_sigma[1] * _across(toward, errors[1]))
-        v = R_IW @ velocity + self.start_sigma[0] * errors[0]
-        return replace(self, velocity=v, down=off @ toward)
+    def _true_start(
+        self, unit: Pose, velocity: Vector, down: Vector, key: Array
+    ) -> tuple[InertialState, Imu]:
+        """The variables at the start of a path, and the model that is told them with their errors,
+        of biases that are drawn."""
+        mean, root = self.start()
+        back = jax.tree.map(lambda x: x[0], unit).rotation().inverse()
+        told = replace(mean, velocity=back @ velocity, down=back @ down)
+        if self.root is None:  # of this direction
+            root = replace(self, down=told.down).start()[1]
+        off = root @ jax.random.normal(key, (12,), root.dtype)
+        off = retract(jax.tree.map(jnp.zeros_like, mean), off)
+        direction = told.down + off.down
+        truth = replace(
+            told,
+            gyroscope_bias=mean.gyroscope_bias + off.gyroscope_bias,
+            accelerometer_bias=mean.accelerometer_bias + off.accelerometer_bias,
+        )
+        told = replace(
+            told,
+            velocity=told.velocity - off.velocity,
+            down=direction / jnp.linalg.norm(direction),
+        )
+        root = replace(self, down=told.down).start()[1]
+        return truth, self.begun(told, root)
 
-    def _through(
-        self, controls: Increments, unit: Pose, velocity: Vector, down: Vector
-    ) -> Pose:
+    def _through(self, controls: Increments, path: Pose, start: InertialState) -> Pose:
         """The camera's pose in every frame, of readings without errors."""
-        start = jax.tree.map(lambda x: x[0], unit)
-        back, none = start.rotation().inverse(), jnp.zeros(3, velocity.dtype)
-        variables = InertialState(back @ velocity, none, none, back @ down)
-        noise = jnp.zeros(18, velocity.dtype)
+        first = jax.tree.map(lambda x: x[0], path)
+        noise = jnp.zeros(18, start.down.dtype)
 
         def move(carry, control):
             pose, variables = carry
             pose = (pose @ self.displacement(variables, noise, control)).normalize()
             return (pose, self.next(variables, noise, control)), pose
 
-        camera = start @ self.mount.inverse()
-        _, poses = jax.lax.scan(move, (camera, variables), controls)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), camera, poses)
+        _, poses = jax.lax.scan(move, (first, start), controls)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, poses)
 
 
 def _neighbours(batch):
     return jax.tree.map(lambda x: x[:-1], batch), jax.tree.map(lambda x: x[1:], batch)
-
-
-def _across(direction: Vector, vector: Vector) -> Vector:
-    """The part of a vector that is across a direction."""
-    return vector - direction * (direction @ vector)

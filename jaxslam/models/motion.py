@@ -13,7 +13,8 @@ x ahead and y left, as ROS does, a planar velocity (vx, vy, ω) is (−vy, vx, �
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -38,7 +39,9 @@ class AbstractMotion(eqx.Module):
 
     has_velocity: ClassVar[bool] = False
     """Whether its variables are a velocity, linear and angular, and nothing that it is given is in
-    metres: then the scale is free, and a Gaussian sum can divide it."""
+    metres: then the scale is free."""
+    estimates_velocity: ClassVar[bool] = False
+    """Whether its variables begin with a linear velocity, which a Gaussian sum can divide."""
 
     if TYPE_CHECKING:  # a field or a property of each model
 
@@ -53,6 +56,10 @@ class AbstractMotion(eqx.Module):
     def start(self) -> tuple[Variables, Float[Array, "v v"]]:
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
         return (), jnp.zeros((0, 0))
+
+    def begun(self, variables: Variables, root: Float[Array, "v v"]) -> Self:
+        """The model that starts so; of one whose variables are known to start with."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where else it could start")
 
     @abstractmethod
     def displacement(
@@ -111,6 +118,7 @@ class ConstantVelocity(AbstractMotion):
     """Constant velocity with white acceleration; the control is Δt in seconds (P8, P9)."""
 
     has_velocity: ClassVar[bool] = True
+    estimates_velocity: ClassVar[bool] = True
 
     noise_sigma: Float[AnyArray, " t"] = number_field()
     """σ of the acceleration, m/s² and rad/s², in the camera's axes."""
@@ -131,6 +139,9 @@ class ConstantVelocity(AbstractMotion):
     def start(self) -> tuple[Tangent, Float[Array, "t t"]]:
         sigma = jnp.asarray(self.velocity_sigma)
         return jnp.asarray(self.velocity), jnp.diag(sigma) if sigma.ndim == 1 else sigma
+
+    def begun(self, variables: Tangent, root: Float[Array, "t t"]) -> Self:
+        return replace(self, velocity=variables, velocity_sigma=root)
 
     def displacement(self, variables: Tangent, noise: Tangent, control: Number) -> Pose:
         """`T_{k-1,k} = Exp((v + a Δt) Δt)` (P9)."""

@@ -162,7 +162,7 @@ def _read_path(world: World, key: Array) -> tuple[Pose, Control, AbstractMotion]
 
 
 def _swaying(world: World, key: Array, seconds: Array) -> Pose:
-    """A path at the nominal velocity, and what it sways by, from rest in frames that stand still."""
+    """A path at the nominal velocity and what it sways by, after frames that stand still."""
     count = world.steps * world.motion.readings
     time = (jnp.arange(count, dtype=seconds.dtype) + 0.5)[:, None] * seconds
     phase = jax.random.uniform(key, (6,), time.dtype, maxval=2 * jnp.pi)

@@ -68,15 +68,15 @@ class Mixture(AbstractLayer):
         dtype = precision(slam)
         inner = cast(slam.inner, dtype)
         motion = inner.motion
-        velocity, D = motion.start()
-        A = _directions(velocity, D, motion.geometry.point_dim)
+        variables, D = motion.start()
+        n = motion.geometry.point_dim
+        A = _directions(jax.tree.leaves(variables)[0][:n], D)
         A = A[:, :1] if self.split else A
         grid, weights, sigma = _division(self.members, A.shape[1])
         root = D @ (jnp.eye(len(D), dtype=dtype) - (1 - sigma) * A @ A.T)
 
         def begun(place):
-            mean = velocity + D @ A @ place
-            surer = replace(motion, velocity=mean, velocity_sigma=root)
+            surer = motion.begun(retract(variables, D @ A @ place), root)
             begun = eqx.tree_at(lambda slam: slam.motion, inner, surer)
             return begun.init(capacity, first, known)
 
@@ -178,16 +178,14 @@ class Mixture(AbstractLayer):
         return weighed(members, state.log_weights, innovations)
 
 
-def _directions(
-    velocity: Float[Array, " v"], D: Float[Array, "v v"], n: int
-) -> Float[Array, "v m"]:
-    """Orthonormal directions of e that turn the velocity, of n linear numbers, and do not change
-    the speed."""
-    linear = jnp.zeros_like(velocity).at[:n].set(velocity[:n])
+def _directions(linear: Float[Array, " n"], D: Float[Array, "v v"]) -> Float[Array, "v m"]:
+    """Orthonormal directions of e that turn the linear velocity, the first of the numbers whose
+    root is D, and do not change the speed."""
+    n = linear.size
     still = jnp.linalg.norm(linear) == 0
-    speed = D.T @ jnp.where(still, jnp.eye(velocity.size)[0].astype(D.dtype), linear)
+    speed = jnp.where(still, jnp.eye(len(D))[0].astype(D.dtype), D[:n].T @ linear)
     speed = speed[:, None] / jnp.maximum(jnp.linalg.norm(speed), jnp.finfo(D.dtype).tiny)
-    by_linear = D.T[:, :n]
+    by_linear = D[:n].T
     projected = by_linear - speed @ (speed.T @ by_linear)
     _, vectors = eigh(projected @ projected.T)
     return vectors[:, :-n:-1]
