@@ -86,34 +86,35 @@ def increments(
     """
     seconds, gyroscope, accelerometer = map(jnp.asarray, (seconds, gyroscope, accelerometer))
     bias = jnp.zeros(6, seconds.dtype) if bias is None else jnp.asarray(bias)
+    rates = jnp.concatenate([gyroscope, accelerometer], axis=1) - bias
     mean, slope = _two_polynomials(seconds)
-    readings = seconds, jnp.concatenate([gyroscope, accelerometer], axis=1) - bias, mean, slope
+    turned, sped, moved = _integrated(seconds, rates)
 
-    def integrated(off: Float[Array, " 18"]) -> tuple[jaxlie.SO3, Vector, Vector]:
-        off_bias, of_mean, of_slope = off[:6], off[6:12], off[12:]
-
-        def one(carry, reading):
-            turned, sped, moved = carry
-            h, rates, mean, slope = reading
-            rates = rates - off_bias - mean * of_mean - slope * of_slope
-            half = exp(jaxlie.SO3, rates[:3] * h / 2)
-            gain = turned @ half @ rates[3:] * h
-            moved = moved + sped * h + gain * h / 2
-            return ((turned @ half @ half).normalize(), sped + gain, moved), None
-
-        none = jnp.zeros(3, off.dtype)
-        start = (jax.tree.map(lambda x: x.astype(off.dtype), jaxlie.SO3.identity()), none, none)
-        return jax.lax.scan(one, start, readings)[0]
-
-    zero = jnp.zeros(18, seconds.dtype)
-    turned, sped, moved = integrated(zero)
-
-    def change(off):
-        to, by, at = integrated(off)
+    def change(off: Float[Array, " 18"]) -> Float[Array, " 9"]:
+        noise = jnp.outer(mean, off[6:12]) + jnp.outer(slope, off[12:])
+        to, by, at = _integrated(seconds, rates - off[:6] - noise)
         return jnp.concatenate([log(turned.inverse() @ to), by, at])
 
-    J = jax.jacfwd(change)(zero)
+    J = jax.jacfwd(change)(jnp.zeros(18, seconds.dtype))
     return Increments(jnp.sum(seconds), turned, sped, moved, bias, J[:, :6], J[:, 6:])
+
+
+def _integrated(
+    seconds: Float[Array, " m"], rates: Float[Array, "m 6"]
+) -> tuple[jaxlie.SO3, Vector, Vector]:
+    """ΔR, Δv and Δp of readings without errors."""
+
+    def one(carry, reading):
+        turned, sped, moved = carry
+        h, rates = reading
+        half = exp(jaxlie.SO3, rates[:3] * h / 2)
+        middle = turned @ half
+        gain = middle @ rates[3:] * h
+        return ((middle @ half).normalize(), sped + gain, moved + (sped + gain / 2) * h), None
+
+    none = jnp.zeros(3, rates.dtype)
+    start = identity(SPATIAL, rates.dtype).rotation(), none, none
+    return jax.lax.scan(one, start, (seconds, rates))[0]
 
 
 def _two_polynomials(
@@ -269,14 +270,17 @@ class Imu(AbstractMotion):
         white = jnp.repeat(jnp.asarray(self.density), 3) / root
         read = rates + start.bias + walked * root + white * normal(noise_key, rates.shape)
 
-        def each_step(rates, bias):
-            rates = rates.reshape(-1, self.readings, 6)
-            at = jnp.full(rates.shape[1], seconds)
-            return jax.vmap(lambda x: increments(at, x[:, :3], x[:, 3:], bias))(rates)
+        def of_steps(values):
+            return values.reshape(-1, self.readings, *values.shape[1:])
 
-        exact = replace(start, gyroscope_bias=jnp.zeros(3), accelerometer_bias=jnp.zeros(3))
-        poses = self._through(each_step(rates, None), path, exact)
-        return poses, each_step(read, self.bias), told
+        at = jnp.full(self.readings, seconds)
+        # One step after another: their derivatives together do not fit a processor's cache.
+        controls = jax.lax.map(
+            lambda x: increments(at, x[:, :3], x[:, 3:], self.bias), of_steps(read)
+        )
+        moved = jax.vmap(lambda x: _integrated(at, x))(of_steps(rates))
+        poses = self._through(moved, path, start, self.readings * seconds)
+        return poses, controls, told
 
     def _true_start(
         self, unit: Pose, velocity: Vector, down: Vector, key: Array
@@ -304,17 +308,28 @@ class Imu(AbstractMotion):
         root = replace(self, down=told.down).start()[1]
         return truth, self.begun(told, root)
 
-    def _through(self, controls: Increments, path: Pose, start: InertialState) -> Pose:
+    def _through(
+        self,
+        moved: tuple[jaxlie.SO3, Vector, Vector],
+        path: Pose,
+        start: InertialState,
+        seconds: Scalar,
+    ) -> Pose:
         """The camera's pose in every frame, of readings without errors."""
         first = jax.tree.map(lambda x: x[0], path)
-        noise = jnp.zeros(18, start.down.dtype)
+        none = jnp.zeros(3, start.down.dtype)
+        start = replace(start, gyroscope_bias=none, accelerometer_bias=none)
+        still = replace(self.still(none.dtype), seconds=seconds)
+        noise = jnp.zeros(18, none.dtype)
 
-        def move(carry, control):
+        def move(carry, moved):
             pose, variables = carry
+            turned, sped, moved = moved
+            control = replace(still, turned=turned, sped=sped, moved=moved)
             pose = (pose @ self.displacement(variables, noise, control)).normalize()
             return (pose, self.next(variables, noise, control)), pose
 
-        _, poses = jax.lax.scan(move, (first, start), controls)
+        _, poses = jax.lax.scan(move, (first, start), moved)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, poses)
 
 
