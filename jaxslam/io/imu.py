@@ -169,11 +169,11 @@ def _of_table(
     found: dict[str, list[tuple[int, str]]] = {}
     for column, title in enumerate(table.titles):
         base, _, unit = re.sub(r"[\])]", "", title.lower()).replace("(", "[").partition("[")
-        name = re.sub(r"[^\wωµμ°]+", "_", base).strip("_")
+        name = re.sub(r"[^\w°]+", "_", base).strip("_")
         for what, pattern in _MEANINGS.items():
             own = re.fullmatch(rf"(?:.*?_)??{pattern}", name)
             if own and not re.match(_NO_READING, name):
-                unit = re.sub(r"[\W_]", "", unit or own[2] or "")
+                unit = re.sub(r"[^\w°]|_", "", unit or own[2] or "")
                 found.setdefault(what + own[1], []).append((column, unit))
                 break
     readings = [what + axis for what in "ga" for axis in "xyz"]

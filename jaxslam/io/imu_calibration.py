@@ -94,7 +94,7 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     place = ", ".join(map(str, files or paths))
     densities = [_density(place, sensor, name) for name in _DENSITIES]
     T_CI = _camera_from_imu(place, sensor, mount)
-    if not_rigid(T_CI, 0.01) or np.abs(T_CI[:3, 3]).max() > _FARTHEST:
+    if not_rigid(T_CI[None], 0.01)[0] or np.abs(T_CI[:3, 3]).max() > _FARTHEST:
         raise ValueError(
             f"{place}: the camera's pose in the IMU is no rotation, or farther than "
             f"{_FARTHEST:g} m; expected [R t; 0 1] with R orthonormal and t in metres"
