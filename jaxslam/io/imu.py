@@ -25,10 +25,7 @@ CALIBRATIONS = (
     "mav0/cam0/sensor.yaml", "dso/camchain.yaml",
 )  # fmt: skip
 """Where a folder of pictures has the calibration of its IMU, all that are there."""
-EXPECTED = (
-    "seven numbers t, gyroscope x y z (rad/s), accelerometer x y z (m/s²), or titles such as "
-    "timestamp, gx, gy, gz, ax, ay, az"
-)
+EXPECTED = "seven numbers t, gyroscope (rad/s), accelerometer (m/s²), or titles t,gx,gy,gz,ax,ay,az"
 _GRAVITY = 9.80665
 _STEPS = (1e-4, 0.1)
 """From a reading to the next, s: no two units of time fit."""
@@ -85,8 +82,8 @@ class InertialLog(NamedTuple):
         first, last = self.times[[0, -1]].tolist()
         if not first - _TOUCH <= start < end <= last + _TOUCH:
             clock = "; the clocks differ" if start > last or end < first else ""
-            told = f"readings go from {first:.6f} s to {last:.6f} s, frames on to {end:.6f} s"
-            raise ValueError(f"{self.name}: {told}, from {start:.6f} s{clock}")
+            told = f"readings from {first:.6f} s to {last:.6f} s do not cover those from"
+            raise ValueError(f"{self.name}: {told} {start:.6f} s to {end:.6f} s{clock}")
         low, high = np.searchsorted(self.times, start, "right"), np.searchsorted(self.times, end)
         near = slice(max(low - 1, 0), high + 1)
         own = self.times[near]
@@ -162,10 +159,8 @@ def _row(message: Message) -> list[float]:
     return row
 
 
-def _of_table(
-    table: Table,
-) -> tuple[Float[np.ndarray, "n 7"], float | None, tuple[str, ...]]:
-    """Rows of a time and readings, how many units of time are a second if that is said, notes."""
+def _of_table(table: Table) -> tuple[np.ndarray, float | None, tuple[str, ...]]:
+    """Rows (n, 7), how many units of their time are a second where that is said, and notes."""
     found: dict[str, list[tuple[int, str]]] = {}
     for column, title in enumerate(table.titles):
         base, _, unit = re.sub(r"[\])]", "", title.lower()).replace("(", "[").partition("[")
@@ -248,20 +243,20 @@ def _increasing(
             f"{name}: {back.sum()} of {len(whole)} stamps go back, the first from {latest[i]:.6f} "
             f"to {whole[i, 0]:.6f}; expected readings of one sensor in order of time"
         )
-    rows = whole[~(twice | back)]
-    if len(rows) < 3:
-        raise ValueError(
-            f"{name}: {len(rows)} of {count} readings have a time, three rates and three specific "
-            "forces; expected a gyroscope and an accelerometer in one log, at least three readings"
-        )
     left = {
         "are not finite": count - len(whole),
         "have the stamp of the one before": int(twice.sum()),
         "have a stamp that goes back": int(back.sum()),
     }
-    return rows, tuple(
-        f"{n} of {count} readings {what}, and are left out" for what, n in left.items() if n
-    )
+    rows = whole[~(twice | back)]
+    told = tuple(f"{n} of {count} readings {x}, and are left out" for x, n in left.items() if n)
+    if len(rows) < 3:
+        which = f" ({'; '.join(told)})" if told else ""
+        raise ValueError(
+            f"{name}: {len(rows)} readings{which}; expected at least three, each with a time after "
+            "the one before, three rates and three specific forces"
+        )
+    return rows, told
 
 
 def _plausible(
@@ -271,24 +266,18 @@ def _plausible(
     low, force, high = np.quantile(np.linalg.norm(accelerometer, axis=1), [0.25, 0.5, 0.75])
     rate = float(np.median(np.linalg.norm(gyroscope, axis=1)))
     least, most = 0.5 * _GRAVITY, 2 * _GRAVITY
-    wrong, do = "", ""
-    if force < least and 0.75 * _GRAVITY < rate < 1.25 * _GRAVITY:
-        wrong = f"rates of {rate:.3g} rad/s and forces of {force:.3g} m/s² are swapped"
-        do = "put the gyroscope first, or name the columns"
-    elif 0.8 < force < 1.25 and high - low < 0.4 * force:
-        wrong = f"specific forces of {force:.3g} m/s² look like g"
-        do = f"title their columns [g], or multiply them by {_GRAVITY}"
-    elif force < least:
-        wrong = f"specific forces of {force:.3g} m/s² are without gravity"
-        do = "log what the accelerometer measures (Android: not the linear acceleration)"
-    elif force > most:
-        wrong = (
-            f"specific forces of {force:.3g} m/s² are no multiple of gravity that people move at"
-        )
-        do = "give m/s², or title their columns [mg]"
-    elif rate > 10:
-        wrong = f"rates of {rate:.3g} rad/s look like degrees"
-        do = "title their columns [deg/s], or multiply them by π/180"
-    if wrong:
-        raise ValueError(f"{name}: {wrong} (medians); {do}")
+    for holds, wrong, do in (
+        (force < least and abs(rate / _GRAVITY - 1) < 0.25, "rates and specific forces are swapped",
+         "put the gyroscope first, or name the columns"),
+        (0.8 < force < 1.25 and high - low < 0.4 * force, "specific forces look like g",
+         f"title their columns [g], or multiply them by {_GRAVITY}"),
+        (force < least, "specific forces are without gravity",
+         "log what the accelerometer measures (Android: not the linear acceleration)"),
+        (force > most, "specific forces are large", "give m/s², or title their columns [mg]"),
+        (rate > 10, "rates look like degrees",
+         "title their columns [deg/s], or multiply them by π/180"),
+    ):  # fmt: skip
+        if holds:
+            medians = f"medians of {rate:.3g} rad/s and {force:.3g} m/s²"
+            raise ValueError(f"{name}: {wrong} ({medians}); {do}")
     return (f"rates of {rate:.3g} rad/s (median) are high; are they degrees?",) * (rate > 3)

@@ -3,6 +3,7 @@
 Files are those of Kalibr, OpenVINS, EuRoC (also TUM-VI) and ORB-SLAM3.
 """
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +25,10 @@ _DENSITIES = {
 }
 """ORB-SLAM3's names of Kalibr's densities, their units, and more than any sensor has."""
 _RATES = ("update_rate", "rate_hz", "IMU.Frequency")
-_CAMERA_IN_IMU = ("T_imu_cam", "IMU.T_b_c1.data", "Tbc.data", "body_T_cam0.data")
+_CAMERAS = {"T_cam_imu": False, **dict.fromkeys(("T_imu_cam", "IMU.T_b_c1.data", "Tbc.data"), True)}
+"""Names of T_CI, and of its inverse."""
+_SHAPES = ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC", "gyroscopes.M", "accelerometers.M")
+"""What OpenVINS and Kalibr call scale factors, misalignments and turns of the two sensors."""
 _FARTHEST = 10.0
 """Metres between a camera and its IMU."""
 
@@ -33,13 +37,13 @@ class InertialCalibration(NamedTuple):
     """The noise of an IMU, white and of its biases, and where it is on the camera."""
 
     gyroscope_noise_density: float
-    """Of white noise, rad/s/√Hz: σ of a reading is the density times √rate."""
+    """White noise, rad/s/√Hz: σ of a reading is the density times √rate."""
     gyroscope_random_walk: float
-    """Of the bias, rad/s²/√Hz: σ of its change in t seconds is the density times √t."""
+    """The bias, rad/s²/√Hz: σ of its change in t seconds is the density times √t."""
     accelerometer_noise_density: float
-    """Of white noise, m/s²/√Hz."""
+    """White noise, m/s²/√Hz."""
     accelerometer_random_walk: float
-    """Of the bias, m/s³/√Hz."""
+    """The bias, m/s³/√Hz."""
     camera_from_imu: Float[np.ndarray, "4 4"]
     """T_CI (m): a point p in the IMU's axes is T_CI p in those of the camera."""
     clock_offset: float = 0.0
@@ -78,7 +82,8 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     `imu0/sensor.yaml` or ORB-SLAM3's settings. The camera is at T_CI, the `T_cam_imu` of Kalibr's
     camchain (or the inverse of `T_imu_cam`), after the inverse of the IMU's `T_i_b` where there is
     one; or at T_BC⁻¹ T_BI, the two `T_BS` of EuRoC, whose body is the IMU where it states none.
-    Raises ValueError for what is missing, or implausible, by its name.
+    Raises ValueError for what is missing, or implausible, by its name, and warns of scale factors
+    and misalignments, which are not read.
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -88,19 +93,21 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     mount: dict[str, object] = {}
     for file in files:
         text_lines(file, "calibration")  # which says what cannot be read
-        fields = yaml_keys(file.read_text(encoding="utf-8-sig"))
+        fields = yaml_keys(file.read_text(encoding="utf-8-sig", errors="replace"))
         of_imu = any({name, other} & fields.keys() for name, (other, *_) in _DENSITIES.items())
         (sensor if of_imu else mount).update(fields)
     place = ", ".join(map(str, files or paths))
     densities = [_density(place, sensor, name) for name in _DENSITIES]
     T_CI = _camera_from_imu(place, sensor, mount)
-    if not_rigid(T_CI[None], 0.01)[0] or np.abs(T_CI[:3, 3]).max() > _FARTHEST:
-        raise ValueError(
-            f"{place}: the camera's pose in the IMU is no rotation, or farther than "
-            f"{_FARTHEST:g} m; expected [R t; 0 1] with R orthonormal and t in metres"
-        )
     left, _, right = np.linalg.svd(T_CI[:3, :3])  # rounding in the file, taken away
     T_CI[:3, :3] = left @ right
+    shapes = {name: numbers_of(sensor.get(name)) for name in _SHAPES}
+    uneven = [
+        x for x, M in shapes.items() if M and not np.allclose(M, np.eye(3).ravel(), atol=1e-3)
+    ]
+    if uneven:
+        told = f"{', '.join(uneven)} of the IMU are not applied to its readings"
+        warnings.warn(f"{place}: {told}; apply them before", stacklevel=2)
     shift = numbers_of((sensor | mount).get("timeshift_cam_imu"))
     rate = next((x[0] for key in _RATES if (x := numbers_of(sensor.get(key)))), None)
     return InertialCalibration(*densities, T_CI, shift[0] if shift else 0.0, rate)
@@ -109,15 +116,11 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
 def _density(place: str, fields: dict[str, object], name: str) -> float:
     other, unit, most = _DENSITIES[name]
     found = numbers_of(fields.get(name, fields.get(other)))
-    if len(found) != 1:
+    if len(found) != 1 or not 0 <= found[0] <= most or (found[0] == 0 and "noise" in name):
+        told = f"{name} is {found[0]:g}" if found else f"{name} is missing"
         raise ValueError(
-            f"{place}: {name} is missing; expected a number in {unit}, in Kalibr's imu.yaml or "
-            "EuRoC's imu0/sensor.yaml"
-        )
-    if not 0 <= found[0] <= most or (found[0] == 0 and "noise" in name):
-        raise ValueError(
-            f"{place}: {name} is {found[0]:g} {unit}; expected a positive density up to {most:g} "
-            "(divide the σ of a reading by √update_rate, and multiply degrees by π/180)"
+            f"{place}: {told}; expected a positive density in {unit}, up to {most:g} (divide the σ "
+            "of a reading by √rate, and multiply degrees by π/180)"
         )
     return found[0]
 
@@ -126,21 +129,30 @@ def _camera_from_imu(
     place: str, sensor: dict[str, object], mount: dict[str, object]
 ) -> Float[np.ndarray, "4 4"]:
     """T_CI by the keys of an IMU and of a camera. Raises ValueError where there is none."""
-    both = sensor | mount
-    named = [("T_cam_imu", both), *[(name, both) for name in _CAMERA_IN_IMU], ("T_BS.data", mount)]
-    for name, fields in named:
-        if len(told := numbers_of(fields.get(name))) == 16:
-            T = np.reshape(told, (4, 4))
-            body = numbers_of(sensor.get("T_BS.data" if name == "T_BS.data" else "T_i_b"))
-            T_own = np.reshape(body, (4, 4)) if len(body) == 16 else np.eye(4)
-            try:
-                if name == "T_cam_imu":
-                    return T @ np.linalg.inv(T_own)
-                T_own = T_own if name == "T_BS.data" else np.linalg.inv(T_own)
-                return np.linalg.solve(T, T_own)
-            except np.linalg.LinAlgError:
-                raise ValueError(f"{place}: {name} is singular; expected [R t; 0 1]") from None
-    raise ValueError(
-        f"{place}: the pose of the camera is missing; expected T_cam_imu of Kalibr's camchain, "
-        "OpenVINS' T_imu_cam, or EuRoC's cam0/sensor.yaml (T_BS)"
-    )
+    T_CB = _pose(place, sensor | mount, _CAMERAS)
+    of_body = {"T_i_b": True}
+    if T_CB is None:
+        T_CB, of_body = _pose(place, mount, {"T_BS.data": True}), {"T_BS.data": False}
+    if T_CB is None:
+        raise ValueError(
+            f"{place}: the pose of the camera is missing; expected T_cam_imu of Kalibr's camchain, "
+            "OpenVINS' T_imu_cam, or EuRoC's cam0/sensor.yaml (T_BS)"
+        )
+    T_BI = _pose(place, sensor, of_body)
+    return T_CB if T_BI is None else T_CB @ T_BI
+
+
+def _pose(
+    place: str, fields: dict[str, object], names: dict[str, bool]
+) -> Float[np.ndarray, "4 4"] | None:
+    """The first pose of these names, inverted where that is said; None without one."""
+    name = next((x for x in names if len(numbers_of(fields.get(x))) == 16), "")
+    if not name:
+        return None
+    T = np.reshape(numbers_of(fields[name]), (4, 4))
+    if not_rigid(T[None], 0.01)[0] or np.abs(T[:3, 3]).max() > _FARTHEST:
+        raise ValueError(
+            f"{place}: {name} is no pose; expected [R t; 0 1] with R orthonormal and t in metres, "
+            f"up to {_FARTHEST:g} m"
+        )
+    return np.linalg.inv(T) if names[name] else T

@@ -105,7 +105,10 @@ def test_a_topic_without_forces_says_so(tmp_path):
     r = ros_of("run.bag")
     told = [r.imu(*row, force_known=False) for row in zip(TIMES, RATES, FORCES, strict=True)]
     path = write_bag(tmp_path / "run.bag", {"/gyro": told})
-    refused("run.bag:/gyro: 0 of 201 readings have a time, three rates and three", path)
+    refused(
+        r"run.bag:/gyro: 0 readings \(201 of 201 readings are not finite, .*\); expected at least",
+        path,
+    )
 
 
 def refused(message, path):
@@ -148,13 +151,13 @@ def changed(*, rows=slice(None), scale=(1, 1), swap=False, noise=0.0, stamps=Non
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (changed(swap=True), r"rates of 9\.\d+ rad/s and forces of 0\.\d+ m/s² are swapped .*fi"),
-        (changed(scale=(100, 1)), r"rates of [\d.]+ rad/s look like degrees .*\[deg/s\]"),
-        (changed(scale=(1, G)), r"forces of [\d.]+ m/s² look like g .*\[g\], or mu.* 9\.80665"),
-        (changed(scale=(1, 0), noise=0.6), r"forces of [\d.]+ m/s² are without gravity .*Android"),
-        (changed(scale=(1, 1e3 * G)), r"forces of 9\d\d m/s² are no multiple of gravity .*\[mg\]"),
+        (changed(swap=True), r"specific forces are swapped \(medians of 9\.\d+ rad/s and .* first"),
+        (changed(scale=(100, 1)), r"rates look like degrees .*\[deg/s\]"),
+        (changed(scale=(1, G)), r"specific forces look like g .*\[g\], or multiply .* 9\.80665"),
+        (changed(scale=(1, 0), noise=0.6), r"specific forces are without gravity .*Android"),
+        (changed(scale=(1, 1e3 * G)), r"specific forces are large .* 9\d\d m/s²\).*\[mg\]"),
         (changed(rows=slice(None, None, -1)), r"200 of 201 stamps go back, the first from"),
-        (changed(rows=slice(2)), "2 of 2 readings have a time.*at least three"),
+        (changed(rows=slice(2)), "2 readings; expected at least three, each"),
         (changed(rows=slice(None, None, 30)), r"readings are 0\.15 s apart; expected an IMU of"),
     ],
 )  # fmt: skip
@@ -229,8 +232,8 @@ GAP = inertial_log("mine", np.delete(np.column_stack([SINCE, RATES, FORCES]), ra
 @pytest.mark.parametrize(
     ("log", "times", "message"),
     [
-        (LOG, [-0.1, 0.1, 0.2], "from frame 0 to 1: the log: readings go from 0.0* s to 1.0* s, f"),
-        (LOG, [0.8, 0.9, 1.1], r"from frame 1 to 2: .*, frames on to 1.1\d* s, from 0.9"),
+        (LOG, [-0.1, 0.1, 0.2], "from frame 0 to 1: the log: readings from 0.0* s to 1.0* s do"),
+        (LOG, [0.8, 0.9, 1.1], r"from frame 1 to 2: .* do not cover those from 0\.9\d* s to 1\.1"),
         (LOG, [EPOCH + 0.5, EPOCH + 1.5], "from frame 0 to 1: .*; the clocks differ"),
         (LOG, [0.1, 0.3, 0.2], "from frame 1 to 2: .* from 0.3 s to 0.2 s is empty"),
         (LOG, [0.1, np.nan], "from frame 0 to 1: .* is empty"),
