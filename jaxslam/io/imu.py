@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.io.ros import Message, bag_and_topic, chosen, messages, seconds
 from jaxslam.io.text import Table, read_table
 
@@ -161,6 +162,7 @@ def _row(message: Message) -> list[float]:
 
 def _of_table(table: Table) -> tuple[np.ndarray, float | None, tuple[str, ...]]:
     """Rows (n, 7), how many units of their time are a second where that is said, and notes."""
+    cells = np.where(np.abs(table.rows) <= LARGEST, table.rows, np.nan)
     found: dict[str, list[tuple[int, str]]] = {}
     for column, title in enumerate(table.titles):
         base, _, unit = re.sub(r"[\])]", "", title.lower()).replace("(", "[").partition("[")
@@ -178,15 +180,15 @@ def _of_table(table: Table) -> tuple[np.ndarray, float | None, tuple[str, ...]]:
             told = f"{table.rows.shape[1]} columns{titles} are no readings of an IMU"
             raise ValueError(f"{table.place(0)}: {told}; expected {EXPECTED}")
         note = f"titles{titles} that are not known are taken as t, gyroscope, accelerometer"
-        return table.rows, None, (note,) * bool(titles)
+        return cells, None, (note,) * bool(titles)
     times = [x for x in found["t"] if "stamp" in table.titles[x[0]].lower()] or found["t"]
     parts = [x for x in times if re.fullmatch(r"n?(ano)?secs?", x[1])]  # of ROS: both make a time
     times = parts if len(parts) == 2 else times[:1]
     told = [_first(_TICKS, unit) for _, unit in times]
     columns = [found[what][0] for what in readings]
     factors = [_first(_UNITS, unit) or 1.0 for _, unit in columns]
-    t = sum(table.rows[:, i] / (ticks or 1.0) for (i, _), ticks in zip(times, told, strict=True))
-    rows = np.column_stack([t, table.rows[:, [i for i, _ in columns]] * factors])
+    t = sum(cells[:, i] / (ticks or 1.0) for (i, _), ticks in zip(times, told, strict=True))
+    rows = np.column_stack([t, cells[:, [i for i, _ in columns]] * factors])
     return rows, None if told[0] is None else 1.0, ()
 
 
