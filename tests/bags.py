@@ -83,6 +83,17 @@ class Ros:
             "sensor_msgs/Image", self.header(t), *size, encoding, big, step, rows.ravel()
         )
 
+    def imu(self, t, rates, forces, *, force_known=True):
+        unknown = np.r_[-1.0, np.zeros(8)]
+        turn = self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        rates, forces = (
+            self.make("geometry_msgs/Vector3", *map(float, x)) for x in (rates, forces)
+        )
+        of_force = np.zeros(9) if force_known else unknown
+        return self.make(
+            "sensor_msgs/Imu", self.header(t), turn, unknown, rates, np.zeros(9), forces, of_force
+        )
+
     def compressed(self, t, data, form="jpeg"):
         return self.make("sensor_msgs/CompressedImage", self.header(t), form, np.ravel(data))
 

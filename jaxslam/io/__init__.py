@@ -13,6 +13,8 @@ _NAMES = {
     "opening": ("open_source", "open_recording"),
     "calibration": ("Calibration", "write_calibration"),
     "lens_files": ("read_calibration",),
+    "imu": ("InertialLog", "read_inertial"),
+    "imu_calibration": ("InertialCalibration", "read_inertial_calibration"),
 }
 """Where each name is that is imported only when it is asked for."""
 __all__ = ["read_tum", "write_tum", *chain(*_NAMES.values())]

@@ -53,7 +53,7 @@ def read_calibration(path: str | Path) -> Calibration:
             return from_fields(fields) if plain else of_keys(_flat(fields))
         if any(re.fullmatch(r"\d+ [A-Z_]+( [-+.\deE]+)+", line) for line in lines):
             return _of_colmap(lines)
-        return of_keys(_of_yaml(Path(path).read_text(encoding="utf-8-sig")))
+        return of_keys(yaml_keys(Path(path).read_text(encoding="utf-8-sig")))
     except ValueError as error:
         told = f"not a JSON file ({error})" if isinstance(error, json.JSONDecodeError) else error
         raise ValueError(f"{path}: {told}; expected {ACCEPTED}") from None
@@ -61,17 +61,19 @@ def read_calibration(path: str | Path) -> Calibration:
 
 def of_keys(fields: dict[str, object]) -> Calibration:
     """The calibration of the keys that programs use. Raises ValueError for what is none."""
-    size = _values(fields.get("resolution"))
+    size = numbers_of(fields.get("resolution"))
     if len(size) != 2:
         size = [x for names in _SIZE for x in _first(fields, names)]
-    matrix = _first(fields, _MATRIX) or _values([fields.get(f"Camera.{x}") for x in INTRINSICS])
+    matrix = _first(fields, _MATRIX) or numbers_of([fields.get(f"Camera.{x}") for x in INTRINSICS])
     matrix = [matrix[i] for i in (0, 4, 2, 5)] if len(matrix) == 9 else matrix
     names = [str(fields[key]) for key in _NAMES if fields.get(key)]
-    names += ["fisheye"] if _values(fields.get("fisheye_model")) == [1.0] else []  # OpenCV's flag
+    names += (
+        ["fisheye"] if numbers_of(fields.get("fisheye_model")) == [1.0] else []
+    )  # OpenCV's flag
     distortion = _first(fields, _DISTORTION)
     if not distortion and "Camera.k1" in fields:
         order = "k1 k2 k3 k4" if "Camera.k4" in fields else "k1 k2 p1 p2 k3"
-        distortion = _values([fields.get(f"Camera.{x}", 0) for x in order.split()])
+        distortion = numbers_of([fields.get(f"Camera.{x}", 0) for x in order.split()])
     model, distortion = lens(names, distortion)
     if len(size) != 2 or len(matrix) != 4:
         told = ", ".join(list(fields)[:12]) or "none"
@@ -116,23 +118,28 @@ def _of_colmap(lines: Sequence[str]) -> Calibration:
     return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=distortion, model=model)
 
 
-def _of_yaml(text: str) -> dict[str, object]:
+def yaml_keys(text: str) -> dict[str, object]:
     """The keys, of nested ones joined by dots, and their numbers, lists or words; what such files
-    have of YAML, and the first of several cameras."""
+    have of YAML, and the first of several cameras or IMUs."""
     text = re.sub(r"\[([^\]]*)\]", lambda x: "[" + " ".join(x[1].split()) + "]", text)
-    fields: dict[str, object] = {}
+    whole: dict[str, str] = {}
     above: list[tuple[int, str]] = []
     for line in text.splitlines():
+        name = ".".join(x for _, x in above)
+        if (row := re.match(r"\s*-\s*\[(.*)\]", line)) and name:  # of a matrix
+            whole[name] = f"{whole.get(name, '')} {row[1]}"
         found = re.fullmatch(r"(\s*)([\w./-]+)\s*:(?:\s+(.*?))?\s*(?:#.*)?", line)
         if found is None:
             continue
         indent, key, value = len(found[1]), found[2], re.sub(r"^!!\S+", "", found[3] or "").strip()
         above = [x for x in above if x[0] < indent]
         if value:
-            names = [name for _, name in above if not re.fullmatch(r"cam\d+", name)]
-            fields.setdefault(".".join([*names, key]), value.strip("\"'"))
+            whole.setdefault(".".join([*(x for _, x in above), key]), value.strip("\"'"))
         else:
             above.append((indent, key))
+    fields: dict[str, object] = {}
+    for name, value in whole.items():
+        fields.setdefault(re.sub(r"(^|\.)(cam|imu)\d+\.", r"\1", name), value)
     return fields
 
 
@@ -147,10 +154,10 @@ def _flat(fields: dict[str, object], before: str = "") -> dict[str, object]:
 
 
 def _first(fields: dict[str, object], names: Sequence[str]) -> list[float]:
-    return next((found for name in names if (found := _values(fields.get(name)))), [])
+    return next((found for name in names if (found := numbers_of(fields.get(name)))), [])
 
 
-def _values(told: object) -> list[float]:
+def numbers_of(told: object) -> list[float]:
     """The numbers of a word, or of a list of any depth; none of anything else."""
     if isinstance(told, str):
         words = told.strip("[]").replace(",", " ").split()

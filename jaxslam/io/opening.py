@@ -63,7 +63,7 @@ def open_source(
     check_size(f"{recording.name}: image 0", image, camera)
     source = Source(
         recording.name, camera, recording.times, recording.images, recording.reference,
-        recording.clock,
+        recording.clock, inertial=recording.inertial,
     )  # fmt: skip
     if reference is not None:
         source = replace(source, reference=Trajectory(*read_tum(reference)))

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.imu import InertialFiles, inertial_files
 from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.logs.log import UNITS, unit_of
 from jaxslam.io.source import Image, Trajectory
@@ -32,7 +33,8 @@ Calibrator = Callable[[int, int], Calibration]
 class Recording:
     """A video before its first image is looked at; the fields are those of a `Source`.
 
-    `calibration` is what the layout knows of the camera, or None.
+    `calibration` is what the layout knows of the camera, or None; `inertial` is where its IMU is
+    read (`jaxslam.io.imu`), the readings and the files of its calibration.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Recording:
     calibration: Calibrator | None = None
     reference: Trajectory | None = None
     clock: Callable[[], float] | None = None
+    inertial: InertialFiles | None = None
 
 
 class Layout(NamedTuple):
@@ -68,7 +71,10 @@ def of_files(
     if (own := path / "calibration.json").is_file():
         calibration = fixed(read_calibration(own))
     name = path.resolve().name
-    return Recording(name, times, lambda: map(read_image, files), calibration, reference)
+    inertial = inertial_files(path)
+    return Recording(
+        name, times, lambda: map(read_image, files), calibration, reference, inertial=inertial
+    )
 
 
 def of_listing(

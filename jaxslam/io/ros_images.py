@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.imu import InertialFiles
 from jaxslam.io.lens_files import lens as lens_of
 from jaxslam.io.recording import Calibrator, Layout, Recording, check_increasing, decoded
 from jaxslam.io.ros import BAG, Message, Topic, bag_and_topic, chosen, messages, seconds
@@ -39,7 +40,8 @@ def _open(path: Path, _rate: float) -> Recording:
         told = (x for x in enumerate(messages(topic)) if new[x[0]])
         return (as_image(f"{topic}, message {i}", x) for i, x in told)
 
-    return Recording(f"{topic}", stamps[new], images, _calibrator(topic))
+    lens, inertial = _calibrator(topic), InertialFiles(bag)
+    return Recording(f"{topic}", stamps[new], images, lens, inertial=inertial)
 
 
 def as_image(place: str, message: Message) -> Image:

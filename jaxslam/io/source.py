@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.imu import InertialFiles
 
 Image = UInt8[np.ndarray, "height width"]
 
@@ -38,8 +39,9 @@ class Source:
     `times` (n,) are in seconds; `images` is called anew for every iteration and yields the n
     pictures; `reference` is the true (or a better) trajectory where one is known. A live camera
     has a `clock`, which says when the picture before came, and no times beforehand. The frames
-    are `first`, `first + every`, … of the whole video. Iterating raises `ValueError` for a
-    picture that is missing, cannot be read or does not fit the calibration.
+    are `first`, `first + every`, … of the whole video. `inertial` is where the readings of its IMU
+    are, if it has any. Iterating raises `ValueError` for a picture that is missing, cannot be read
+    or does not fit the calibration.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Source:
     clock: Callable[[], float] | None = None
     first: int = 0
     every: int = 1
+    inertial: InertialFiles | None = None
 
     def __len__(self) -> int:
         return len(self.times)
