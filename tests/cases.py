@@ -165,7 +165,7 @@ class Case:
         return scenario_pieces(self.scenario, calibration)
 
     def controls(self, i=0):
-        return self.runs.controls[i]
+        return jax.tree.map(lambda x: x[i], self.runs.controls)
 
     def filter(self, name, landmark="inverse_scaling", calibration=None):
         """A filter by its name, modifiers and all, with the scenario's numbers."""

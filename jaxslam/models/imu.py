@@ -278,9 +278,14 @@ class Imu(AbstractMotion):
         controls = jax.lax.map(
             lambda x: increments(at, x[:, :3], x[:, 3:], self.bias), of_steps(read)
         )
-        moved = jax.vmap(lambda x: _integrated(at, x))(of_steps(rates))
-        poses = self._through(moved, path, start, self.readings * seconds)
-        return poses, controls, told
+        still = replace(self.still(rates.dtype), seconds=self.readings * seconds)
+
+        def without_errors(rates):
+            turned, sped, moved = _integrated(at, rates)
+            return replace(still, turned=turned, sped=sped, moved=moved)
+
+        exact = jax.vmap(without_errors)(of_steps(rates))
+        return self._through(exact, path, start), controls, told
 
     def _true_start(
         self, unit: Pose, velocity: Vector, down: Vector, key: Array
@@ -308,28 +313,19 @@ class Imu(AbstractMotion):
         root = replace(self, down=told.down).start()[1]
         return truth, self.begun(told, root)
 
-    def _through(
-        self,
-        moved: tuple[jaxlie.SO3, Vector, Vector],
-        path: Pose,
-        start: InertialState,
-        seconds: Scalar,
-    ) -> Pose:
+    def _through(self, controls: Increments, path: Pose, start: InertialState) -> Pose:
         """The camera's pose in every frame, of readings without errors."""
         first = jax.tree.map(lambda x: x[0], path)
         none = jnp.zeros(3, start.down.dtype)
         start = replace(start, gyroscope_bias=none, accelerometer_bias=none)
-        still = replace(self.still(none.dtype), seconds=seconds)
         noise = jnp.zeros(18, none.dtype)
 
-        def move(carry, moved):
+        def move(carry, control):
             pose, variables = carry
-            turned, sped, moved = moved
-            control = replace(still, turned=turned, sped=sped, moved=moved)
             pose = (pose @ self.displacement(variables, noise, control)).normalize()
             return (pose, self.next(variables, noise, control)), pose
 
-        _, poses = jax.lax.scan(move, (first, start), moved)
+        _, poses = jax.lax.scan(move, (first, start), controls)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, poses)
 
 

@@ -9,13 +9,14 @@ from cases import each_geometry, named, quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import PLANAR
+from jaxslam.models.imu import Imu
 from jaxslam.models.motion import ConstantVelocity, Odometry, check_control
 from jaxslam.simulation import scenario
 from jaxslam.simulation.world import MOTIONS
 
 READING = np.array([0.3, -0.1, 0.7, 0.2, -0.5, 0.4])
 ERROR = np.array([0.02, 0.03, -0.01, -0.04, 0.05, 0.02])
-SCENARIOS = {"velocity": "matched", "odometry": "positions"}
+SCENARIOS = {"velocity": "matched", "odometry": "positions", "imu": "imu"}
 
 
 def sigmas(geometry):
@@ -91,6 +92,7 @@ def test_motions_of_scenarios_are_known_by_their_names():
     assert {word: type(motion) for word, motion in made.items()} == {
         "velocity": ConstantVelocity,
         "odometry": Odometry,
+        "imu": Imu,
     }
     assert set(made) == set(MOTIONS)
     assert made["velocity"].has_velocity

@@ -181,6 +181,20 @@ EXPECTED["laps-6dof"] = {
 }  # fmt: skip
 
 
+EXPECTED["imu"] = {
+    "geometry": "spatial", "rate": 10.0, "steps": 300, "motion": "imu", "readings": 40,
+    "velocity": (0.0, 0.0, 1.2, 0.0, -0.3, 0.0), "sway": (0.5, 0.3, 0.5, 0.2, 0.2, 0.2),
+    "placement": "rays", "landmarks": 20, "depth_range": (2.0, 10.0), "pixel_sigma": 1.0,
+    "inverse_depth": pytest.approx((np.log(5) / 8, np.sqrt(0.05 - (np.log(5) / 8) ** 2)), rel=1e-3),
+    "inertial_density": (1.7e-4, 2e-3), "inertial_walk": (2e-5, 3e-3),
+    "inertial_start_sigma": (0.01, 0.017), "inertial_bias_sigma": (0.01, 0.01),
+}  # fmt: skip
+EXPECTED["imu-loose"] = EXPECTED["imu"] | {
+    "inertial_density": (1.7e-3, 2e-2), "inertial_walk": (2e-4, 3e-3),
+    "inertial_start_sigma": (0.1, 0.05), "inertial_bias_sigma": (0.05, 0.2),
+}  # fmt: skip
+
+
 MOMENTS = np.log(6) / 5, np.sqrt(1 / 6 - (np.log(6) / 5) ** 2)  # of 1/z, z uniform in 1–6 m
 for space, moving, axes in (
     ("", {"geometry": "planar", "landmarks": 12, "velocity": (0.0, 1.2, 0.3)}, 3),
