@@ -133,9 +133,23 @@ class SlamModel(eqx.Module):
         """The camera's motion in this step; the identity once it is composed."""
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
-        return self.motion.displacement(
-            core.motion, self._noises(core, context)[0], context.control
-        )
+        noise = self._noises(core, context)[0]
+        return self._in_unit(core, noise, context.control)[0]
+
+    def _in_unit(
+        self, core: Core, noise: Float[Array, " q"], control: Control
+    ) -> tuple[Pose, Variables]:
+        """The displacement of a step and the motion's variables after it, in the unit of the state,
+        in which `_noises` are; where the control is in metres, by way of these."""
+        motion, metric = self.motion, not self.motion.has_velocity
+        if core.log_scale is None or not metric:
+            displacement = motion.displacement(core.motion, noise, control)
+            return displacement, motion.next(core.motion, noise, control)
+        metres = jnp.exp(core.log_scale[0])
+        variables, noise = motion.enlarged(core.motion, noise, metres)
+        displacement = scaled(motion.displacement(variables, noise, control), 1 / metres)
+        variables = motion.next(variables, noise, control)
+        return displacement, motion.enlarged(variables, noise, 1 / metres)[0]
 
     def _noises(
         self, core: Core, context: Context
@@ -156,8 +170,9 @@ class SlamModel(eqx.Module):
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
-        noises = self._noises(core, context)
-        step, variables, delta = self.moved(core.motion, core.calibration, *noises, context.control)
+        noise, drift = self._noises(core, context)
+        step, variables = self._in_unit(core, noise, context.control)
+        delta = self.calibration.next(core.calibration, drift)
         moved, common = self.frame.moves_landmarks, core.depth_error
         if common is not None and self.depth.walk is not None:
             common += core.noise[-1:]

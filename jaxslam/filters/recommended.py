@@ -38,10 +38,14 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
     motion in a window of frames, of at most 5 and 3 members, and a common error that stays.
 
+    For a camera with an inertial unit (`Imu`) it is robocentric in the same unit of length, whose
+    size the unit observes, and the same sum, of 9 members: while the velocity is as unknown as the
+    depths, the filter in metres is over-confident. Nothing has to be carried along the base frame.
+
     For odometry, and for a sensor that measures metres (then of Cartesian points): the paper's
-    filter. What nothing observes
-    is the base frame alone, whose directions do not move with a robocentric estimate: a remedy has
-    nothing to repair, and world-centric filters with one were more over-confident.
+    filter. What nothing observes is the base frame alone, whose directions do not move with a
+    robocentric estimate: a remedy has nothing to repair, and world-centric filters with one were
+    more over-confident.
 
     Other `pieces` are those of `Slam`, and take the place of these. Raises ValueError.
     """
@@ -57,6 +61,8 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
         if not told:
             chosen["mixture"] = Mixture(5 if planar else 3)
             chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
+    elif motion.estimates_velocity and sensor.hidden:
+        chosen = {"scale": ScaleGauge(), "mixture": Mixture(9)}
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})
 
 

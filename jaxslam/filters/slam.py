@@ -193,10 +193,10 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
     motion, sensor = type(slam.motion).__name__, type(slam.sensor).__name__
     frame, landmark, correction = slam.frame, slam.landmark, slam.correction.base
     update, moves, hides = correction.name, slam.motion.has_velocity, slam.sensor.hidden > 0
+    estimated = slam.motion.estimates_velocity
     yield (
-        slam.scale.free and not (moves and hides),
-        f"a scale gauge is for a camera whose motion is a velocity: {motion} and {sensor} measure "
-        "metres",
+        slam.scale.free and not (estimated and hides),
+        f"a scale gauge is for a camera whose velocity is estimated: {motion} or {sensor} has none",
     )
     yield (
         correction.world_centric and (frame.moves_landmarks or frame.reanchors),
@@ -216,10 +216,7 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
         f"{update} is not for {frame.name} filters, whose unobservable directions are not known",
     )
     if slam.mixture is not None:
-        yield (
-            not slam.motion.estimates_velocity,
-            f"a mixture divides a velocity: {motion} has none",
-        )
+        yield not estimated, f"a mixture divides a velocity: {motion} has none"
     if slam.start is not None:
         yield (
             slam.mixture is None or not slam.mixture.split,

@@ -233,6 +233,12 @@ class Imu(AbstractMotion):
             down=back @ (down / jnp.linalg.norm(down)),
         )
 
+    def enlarged(
+        self, variables: InertialState, noise: Float[Array, " 18"], factor: Scalar
+    ) -> tuple[InertialState, Float[Array, " 18"]]:
+        """The velocity in another unit of length; what drives it stays in metres."""
+        return replace(variables, velocity=factor * variables.velocity), noise
+
     def still(self, dtype: DTypeLike | None = None) -> Increments:
         dtype = dtype or jnp.result_type(float)
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxslam.geometry import Scalar
@@ -48,9 +49,10 @@ class ScaleGauge(AbstractScale):
     free: ClassVar[bool] = True
 
     def start(self, motion):
-        velocity, root = motion.start()
-        mean, covariance = velocity_in_gauge(velocity, root, motion.geometry.point_dim)
-        return mean[:-1], mean[-1:], covariance
+        variables, root = motion.start()
+        start, as_variables = ravel_pytree(variables)
+        mean, covariance = velocity_in_gauge(start, root, motion.geometry.point_dim)
+        return as_variables(mean[:-1]), mean[-1:], covariance
 
     def prior(self, mean, sigma, variance):
         """The exact first two moments of `e^λ/z`, linear in λ.

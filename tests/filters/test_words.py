@@ -106,7 +106,7 @@ ODOMETRY = {"motion": "odometry", "odometry_sigma": [0.1] * 3}
 @pytest.mark.parametrize(
     ("scenario_fields", "name", "message"),
     [
-        (ODOMETRY, "scale_gauge", "a scale gauge is for a camera whose motion is a velocity"),
+        (ODOMETRY, "scale_gauge", "a scale gauge is for a camera whose velocity is estimated"),
         (ODOMETRY, "world+mixture", "a mixture divides a velocity: Odometry has none"),
         ({"sensor": "position"}, "world+mixture+rest", "is for a camera; Position measures metres"),
     ],

@@ -1,0 +1,125 @@
+"""A camera with an inertial unit along recorded trajectories, as OpenVINS simulates it.
+
+    JAXSLAM_DATA=data python benchmarks/inertial.py
+
+The recipe (Geneva et al., ICRA 2020): 10 Hz camera, pixels of σ 1, 400 Hz unit of the ADIS16448's
+noise, points thrown at 5 to 7 m, a start that is known to 1 cm/s and 1°. The trajectories are
+`trajectories/udel_gore.txt` and `tum_corridor1.txt` of the folder. Results are added one filter at
+a time; what is there, of as many runs, is not run again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from benchmark import RESULTS, Benchmark, number, table
+from published import interval95
+
+import jaxslam
+from jaxslam.consistency import draw, run_through
+from jaxslam.geometry import log
+from jaxslam.statistics.bands import chi2_quantile, normalised_squared
+
+RECIPE = {"depth_range": [5.0, 7.0], "inverse_depth": [0.1682, 0.0164], "landmarks": 30}
+"""With the mean and σ of 1/z of points that are uniform between 5 and 7 m."""
+PARTS = {"orientation": slice(3, 6), "position": slice(0, 3)}
+TOLD = "first", "last", "end"
+"""Spans of a run: two thirds, and the last second."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inertial(Benchmark):
+    """Filters along recorded trajectories."""
+
+    trajectories: tuple[str, ...] = ("udel_gore", "tum_corridor1")
+    """Names of trajectories in `$JAXSLAM_DATA/trajectories`."""
+    filters: tuple[str, ...] = ("recommended", "invariant", "world+oc", "world", "world+fej")
+    """Filters, with modifiers, of Inverse Scaling."""
+    runs: int = 100
+    """Runs of each."""
+    steps: int = 1600
+    """Frames of every run."""
+    seed: int = 20261128
+    """Seed of the runs."""
+    chunk: int = 25
+    """Runs in one batch."""
+    out: Path = RESULTS / "inertial.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`[trajectory][filter]`: NEES per degree of freedom of orientation and position, of every
+        third and of the last second, and the share of lost runs."""
+        results = self.found()
+        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
+        for trajectory in self.trajectories:
+            for name in self.filters:
+                row = results.setdefault(trajectory, {}).get(name, {})
+                if any(row.get(key) != value for key, value in wanted.items()):
+                    found = self._measured(trajectory, name)
+                    results[trajectory][name] = wanted | found
+                    yield results
+
+    def _measured(self, trajectory: str, name: str) -> dict[str, Any]:
+        world = jaxslam.scenario("imu", RECIPE, trajectory=trajectory, sway=[], steps=self.steps)
+        (slam,) = jaxslam.make_filters(world, [name]).values()
+        nees, errors = _of_runs(slam, world, self)
+        nees = np.where(np.isfinite(nees), nees, np.inf)
+        found: dict[str, Any] = {}
+        for index, part in enumerate(PARTS):
+            third = self.steps // 3
+            spans = {"first": np.s_[:third], "second": np.s_[third : 2 * third]}
+            spans |= {"last": np.s_[2 * third :], "end": np.s_[-10:]}
+            means = {of: nees[:, span, index].mean(axis=1) / 3 for of, span in spans.items()}
+            found[part] = {
+                of: [float(x.mean()), *interval95(np.random.default_rng(0), x, len(x)).tolist()]
+                for of, x in means.items()
+            }
+            found[part]["rmse"] = float(np.sqrt(np.mean(errors[:, -1, index])))
+        lost = (nees > chi2_quantile(0.9999, 3)).any(axis=2)
+        return found | {"lost": float(lost[:, -1].mean())}
+
+    def report(self, results: dict[str, Any]) -> None:
+        for trajectory, filters in results.items():
+            rows = [[name, *_cells(row)] for name, row in filters.items()]
+            header = [f"{part}, {of}" for part in PARTS for of in (*TOLD, "rms")]
+            print(trajectory, table(["filter", *header, "lost"], rows), sep="\n", flush=True)
+
+
+def _cells(row: dict[str, Any]) -> Iterator[str]:
+    for part in PARTS:
+        for of in TOLD:
+            mean, low, high = map(number, row[part][of])
+            yield f"{mean} [{low}, {high}]"
+        yield number(row[part]["rmse"], ".4f")
+    yield f"{100 * row['lost']:.1f} %"
+
+
+def _of_runs(slam, world, options: Inertial) -> tuple[np.ndarray, np.ndarray]:
+    """NEES and squared errors of orientation and position (runs, steps, 2)."""
+
+    def told(state, innovation, frame):
+        estimate, covariance = jaxslam.camera_pose(slam, state)
+        back = estimate.rotation().inverse()
+        position = back @ (frame.pose.translation() - estimate.translation())
+        orientation = log(back @ frame.pose.rotation())
+        errors = zip((orientation, position), PARTS.values(), strict=True)
+        return [(normalised_squared(e, covariance[part, part]), e @ e) for e, part in errors]
+
+    room, runs = draw(world, options.runs, seed=options.seed)
+    one = partial(run_through, slam, room, output=told)
+    batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
+    parts = [
+        jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))
+        for i in range(0, options.runs, options.chunk)
+    ]
+    told = [np.moveaxis(np.array(part), (0, 1), (-2, -1)) for part in parts]
+    return tuple(np.moveaxis(np.concatenate(told), -1, 0))
+
+
+if __name__ == "__main__":
+    Inertial.run()
