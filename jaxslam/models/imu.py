@@ -63,6 +63,8 @@ class InertialState(eqx.Module):
     """m/s²."""
     down: Vector
     """The direction of gravity; its length means nothing, as that of a homogeneous point."""
+    mount: Float[Array, " m"]
+    """The tangent by which T_CI is off, on its right, m and rad; empty where that is known."""
 
     @property
     def bias(self) -> Float[Array, " 6"]:
@@ -152,12 +154,14 @@ class Imu(AbstractMotion):
     """Mean of the direction of gravity, a unit vector: at rest the opposite of the force read."""
     start_sigma: Float[AnyArray, " 2"] = number_field(default=(1.0, 0.1))
     """σ of each number of the velocity, m/s, and of gravity's direction about each axis, rad."""
-    root: Float[AnyArray, "12 12"] | None = eqx.field(default=None, converter=optional_numbers)
-    """R of the covariance `R Rᵀ` of velocity, biases and direction, in place of these σ."""
+    root: Float[AnyArray, "v v"] | None = eqx.field(default=None, converter=optional_numbers)
+    """R of the covariance `R Rᵀ` of velocity, biases, direction and mount, in place of all σ."""
     camera_from_imu: Float[AnyArray, "4 4"] = number_field(
         default=tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
     )
     """T_CI, the pose of the unit in the camera."""
+    mount_sigma: Float[AnyArray, " m"] = number_field(default=())
+    """σ of its position, m, and rotation, rad, about the unit's axes, where they are estimated."""
     gravity: Number = number_field(default=9.81)
     """m/s²."""
     readings: int = eqx.field(static=True, default=40)
@@ -168,32 +172,34 @@ class Imu(AbstractMotion):
         shapes = twos | {"bias": (6,), "velocity": (3,), "down": (3,), "camera_from_imu": (4, 4)}
         for name, shape in shapes.items():
             check_shape(f"{name} of an Imu", getattr(self, name), shape)
+        check_shape("mount_sigma of an Imu", self.mount_sigma, (0,), (6,))
 
     @property
     def geometry(self) -> Geometry:
         return SPATIAL
 
-    @property
-    def mount(self) -> Pose:
-        """T_CI."""
-        return jaxlie.SE3.from_matrix(jnp.asarray(self.camera_from_imu))
+    def mount(self, off: Float[Array, " m"]) -> Pose:
+        """T_CI, on the right of which is what it is off by."""
+        known = jaxlie.SE3.from_matrix(jnp.asarray(self.camera_from_imu))
+        return known @ exp(jaxlie.SE3, off) if off.size else known
 
     @property
     def noise_sigma(self) -> Float[Array, " 18"]:
         white, walk = (jnp.repeat(jnp.asarray(x), 3) for x in (self.density, self.walk))
         return jnp.concatenate([white, white, walk])
 
-    def start(self) -> tuple[InertialState, Float[Array, "12 12"]]:
-        bias, down = jnp.asarray(self.bias), jnp.asarray(self.down)
-        variables = InertialState(jnp.asarray(self.velocity), bias[:3], bias[3:], down)
+    def start(self) -> tuple[InertialState, Float[Array, "v v"]]:
+        bias, down, off = map(jnp.asarray, (self.bias, self.down, self.mount_sigma))
+        velocity = jnp.asarray(self.velocity)
+        variables = InertialState(velocity, bias[:3], bias[3:], down, jnp.zeros_like(off))
         if self.root is not None:
             return variables, jnp.asarray(self.root)
         of_velocity, of_down = self.start_sigma
         sigma = jnp.repeat(jnp.stack([of_velocity, *self.bias_sigma]), 3)
         across = (jnp.eye(3, dtype=down.dtype) - jnp.outer(down, down)) * of_down
-        return variables, jax.scipy.linalg.block_diag(jnp.diag(sigma), across)
+        return variables, jax.scipy.linalg.block_diag(jnp.diag(sigma), across, jnp.diag(off))
 
-    def begun(self, variables: InertialState, root: Float[Array, "12 12"]) -> Imu:
+    def begun(self, variables: InertialState, root: Float[Array, "v v"]) -> Imu:
         v = variables
         return replace(self, velocity=v.velocity, bias=v.bias, down=v.down, root=root)
 
@@ -218,7 +224,8 @@ class Imu(AbstractMotion):
     ) -> Pose:
         """`T_{k-1,k} = T_CI (ΔR, v T + g T²/2 + Δp) T_CI⁻¹`."""
         turned, _, moved, _ = self._moved(variables, noise, control)
-        return self.mount @ joined(turned, moved) @ self.mount.inverse()
+        T_CI = self.mount(variables.mount)
+        return T_CI @ joined(turned, moved) @ T_CI.inverse()
 
     def next(
         self, variables: InertialState, noise: Float[Array, " 18"], control: Increments
@@ -226,7 +233,8 @@ class Imu(AbstractMotion):
         """`v ← ΔRᵀ (v + g T + Δv)`, `g ← ΔRᵀ g`, and the biases a step of their walks further."""
         turned, sped, _, walked = self._moved(variables, noise, control)
         back, down = turned.inverse(), variables.down
-        return InertialState(
+        return replace(
+            variables,
             velocity=back @ (variables.velocity + sped),
             gyroscope_bias=variables.gyroscope_bias + walked[:3],
             accelerometer_bias=variables.accelerometer_bias + walked[3:],
@@ -258,8 +266,10 @@ class Imu(AbstractMotion):
         the readings without errors lead from the first, and the model has a start that is off by
         its σ. Raises ValueError for fewer than three poses.
         """
-        start_key, noise_key, walk_key = jax.random.split(key, 3)
-        unit = jax.vmap(lambda T_WC: T_WC @ self.mount)(path)
+        start_key, mount_key, noise_key, walk_key = jax.random.split(key, 4)
+        sigma = jnp.asarray(self.mount_sigma)
+        off = sigma * jax.random.normal(mount_key, sigma.shape, sigma.dtype)
+        unit = jax.vmap(lambda T_WC: T_WC @ self.mount(off))(path)
         R, p = unit.rotation(), unit.translation()
         v = jnp.gradient(p, axis=0) / seconds
         turns = jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(*_neighbours(R)))
@@ -272,6 +282,7 @@ class Imu(AbstractMotion):
 
         normal, root = partial(jax.random.normal, dtype=rates.dtype), jnp.sqrt(seconds)
         start, told = self._true_start(unit, v[0], down, start_key)
+        start = replace(start, mount=off)
         walked = jnp.cumsum(normal(walk_key, rates.shape), axis=0) * self.noise_sigma[_WHITE:]
         white = jnp.repeat(jnp.asarray(self.density), 3) / root
         read = rates + start.bias + walked * root + white * normal(noise_key, rates.shape)
@@ -303,7 +314,7 @@ class Imu(AbstractMotion):
         told = replace(mean, velocity=back @ velocity, down=back @ down)
         if self.root is None:  # of this direction
             root = replace(self, down=told.down).start()[1]
-        off = root @ jax.random.normal(key, (12,), root.dtype)
+        off = root @ jax.random.normal(key, root.shape[:1], root.dtype)
         off = retract(jax.tree.map(jnp.zeros_like, mean), off)
         direction = told.down + off.down
         truth = replace(

@@ -156,7 +156,10 @@ def _read_path(world: World, key: Array) -> tuple[Pose, Control, AbstractMotion]
     if isinstance(world.trajectory, RecordedMotion):
         path, down = world.trajectory.piece(path_key), -jnp.eye(3, dtype=seconds.dtype)[2]
     else:
-        path, down = _swaying(world, path_key, seconds), motion.mount.rotation() @ motion.down
+        path, down = (
+            _swaying(world, path_key, seconds),
+            motion.mount(jnp.zeros(0)).rotation() @ motion.down,
+        )
     poses, controls, told = motion.along(path, seconds, down, key)
     return from_first(poses), controls, told
 

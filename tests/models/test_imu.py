@@ -5,6 +5,7 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from cases import quick_jit
@@ -12,7 +13,7 @@ from logs import FALSE_ALARM
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from jaxslam.geometry import difference, jacobian, log
+from jaxslam.geometry import difference, exp, jacobian, log
 from jaxslam.models.imu import Imu, increments
 from jaxslam.models.motion import check_control
 from jaxslam.simulation import scenario, simulate
@@ -224,3 +225,26 @@ def test_what_is_told_of_the_start_is_off_by_its_sigma_and_readings_by_theirs():
     found = np.asarray(squared(jax.random.split(jax.random.key(3), 300)))
     p = stats.chi2(6 * 300).cdf(found.sum())
     assert FALSE_ALARM / 2 < p < 1 - FALSE_ALARM / 2
+
+
+def test_a_mount_that_is_estimated_moves_the_camera_as_the_true_one():
+    """`T_CI ← T_CI Exp(δ)`."""
+    imu, control = an_imu(mount_sigma=(0.01,) * 3 + (0.02,) * 3), compiled()(*readings(8))
+    off = jnp.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
+    T_CI = np.asarray(imu.camera_from_imu) @ exp(jaxlie.SE3, off).as_matrix()
+    exact = an_imu(camera_from_imu=T_CI)
+
+    @quick_jit
+    def both():
+        state = replace(variables(imu), mount=off)
+        known = replace(state, mount=jnp.zeros(0))
+        return (
+            imu.displacement(state, NOISE, control),
+            exact.displacement(known, NOISE, control),
+            imu.next(state, NOISE, control).mount,
+        )
+
+    found, expected, after = both()
+    np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-13)
+    np.testing.assert_array_equal(after, off)
+    assert imu.start()[1].shape == (18, 18)
