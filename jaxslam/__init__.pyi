@@ -50,6 +50,7 @@ from jaxslam.models.calibration import AbstractCalibration, Considered, Estimate
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.frame import AbstractFrame, Keyframe, Robocentric, Submaps, WorldCentric
+from jaxslam.models.imu import Imu, Increments, increments
 from jaxslam.models.lens import AbstractLens, Fisheye, Ideal, RadialTangential, Rational
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
@@ -108,6 +109,8 @@ __all__ = [
     "GivenPoints",
     "Ideal",
     "ImagePlane",
+    "Imu",
+    "Increments",
     "Innovation",
     "Invariant",
     "InverseDepth",
@@ -153,6 +156,7 @@ __all__ = [
     "evaluate",
     "evaluate_log",
     "evaluate_poses",
+    "increments",
     "landmark_samples",
     "landmarks_from_above",
     "landmarks_in_camera",

@@ -57,7 +57,7 @@ def test_a_capacity_is_a_whole_number(wrong):
         ({"motion": "velocity"}, "motion is a"),
         ({"sensor": jaxslam.Pinhole(jaxslam.Camera([1.0, 1.0], [0.0, 0.0]), 1.0)}, "points have 2"),
         ({"calibration": jaxslam.White([1.0, 2.0, 3.0])}, "does not fit the sensor"),
-        ({"sensor": jaxslam.Position(0.1), "scale": jaxslam.ScaleGauge()}, "measure metres"),
+        ({"sensor": jaxslam.Position(0.1), "scale": jaxslam.ScaleGauge()}, "or Position has none"),
     ],
 )
 def test_pieces_that_do_not_go_together_are_refused_when_they_are_put_together(pieces, message):

@@ -57,6 +57,11 @@ def test_a_filter_of_ones_own_takes_part_in_a_study(capsys):
     assert ": consistent (p = " in lines[lines.index("mine:") + 1]
 
 
+def test_an_inertial_unit_is_a_motion_as_its_page_says(capsys):
+    run_example("docs/inertial.md")
+    assert capsys.readouterr().out.split("[")[1].split("]")[0].split() == ["0.", "-0.981", "0."]
+
+
 def test_axes_angles_and_controls_are_as_their_page_says():
     assert len(examples("docs/axes.md")) == 1
     run_example("docs/axes.md")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -57,7 +57,7 @@ class AbstractMotion(eqx.Module):
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
         return (), jnp.zeros((0, 0))
 
-    def begun(self, variables: Variables, root: Float[Array, "v v"]) -> Self:
+    def begun(self, variables: Variables, root: Float[Array, "v v"]) -> AbstractMotion:
         """The model that starts so; of one whose variables are known to start with."""
         raise NotImplementedError(f"{type(self).__name__} does not say where else it could start")
 
@@ -140,7 +140,7 @@ class ConstantVelocity(AbstractMotion):
         sigma = jnp.asarray(self.velocity_sigma)
         return jnp.asarray(self.velocity), jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
-    def begun(self, variables: Tangent, root: Float[Array, "t t"]) -> Self:
+    def begun(self, variables: Tangent, root: Float[Array, "t t"]) -> ConstantVelocity:
         return replace(self, velocity=variables, velocity_sigma=root)
 
     def displacement(self, variables: Tangent, noise: Tangent, control: Number) -> Pose:
