@@ -88,47 +88,52 @@ def increments(
     """
     seconds, gyroscope, accelerometer = map(jnp.asarray, (seconds, gyroscope, accelerometer))
     bias = jnp.zeros(6, seconds.dtype) if bias is None else jnp.asarray(bias)
-    rates = jnp.concatenate([gyroscope, accelerometer], axis=1) - bias
-    mean, slope = _two_polynomials(seconds)
-    turned, sped, moved = _integrated(seconds, rates)
+    rates, forces = gyroscope - bias[:3], accelerometer - bias[3:]
+    turned, sped, moved = _integrated(seconds, rates, forces)
+    total = jnp.sum(seconds)
+    slope = _slope(seconds, total)
 
-    def change(off: Float[Array, " 18"]) -> Float[Array, " 9"]:
-        noise = jnp.outer(mean, off[6:12]) + jnp.outer(slope, off[12:])
-        to, by, at = _integrated(seconds, rates - off[:6] - noise)
+    def change(off: Float[Array, " 6"], force_off: Float[Array, " 6"]) -> Float[Array, " 9"]:
+        """Of errors that stay in the step, and of their slopes, in either sensor."""
+        of_rates, of_forces = (x[:3] + jnp.outer(slope, x[3:]) for x in (off, force_off))
+        to, by, at = _integrated(seconds, rates - of_rates, forces - of_forces)
         return jnp.concatenate([log(turned.inverse() @ to), by, at])
 
-    J = jax.jacfwd(change)(jnp.zeros(18, seconds.dtype))
-    return Increments(jnp.sum(seconds), turned, sped, moved, bias, J[:, :6], J[:, 6:])
+    none = jnp.zeros(6, seconds.dtype)
+    # Each sensor by itself: an error of the forces turns nothing.
+    by_rates, by_forces = jax.jacfwd(change, argnums=(0, 1))(none, none)
+    by_bias, by_slope = (
+        jnp.concatenate([by_rates[:, part], by_forces[:, part]], axis=1)
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    by_mean = by_bias / jnp.sqrt(jnp.where(total > 0, total, 1.0))
+    by_noise = jnp.concatenate([by_mean, by_slope], axis=1)
+    return Increments(total, turned, sped, moved, bias, by_bias, by_noise)
 
 
 def _integrated(
-    seconds: Float[Array, " m"], rates: Float[Array, "m 6"]
+    seconds: Float[Array, " m"], rates: Float[Array, "m 3"], forces: Float[Array, "m 3"]
 ) -> tuple[jaxlie.SO3, Vector, Vector]:
     """ΔR, Δv and Δp of readings without errors."""
 
     def one(carry, reading):
         turned, sped, moved = carry
-        h, rates = reading
-        half = exp(jaxlie.SO3, rates[:3] * h / 2)
+        h, rate, force = reading
+        half = exp(jaxlie.SO3, rate * h / 2)
         middle = turned @ half
-        gain = middle @ rates[3:] * h
+        gain = middle @ force * h
         return ((middle @ half).normalize(), sped + gain, moved + (sped + gain / 2) * h), None
 
     none = jnp.zeros(3, rates.dtype)
     start = identity(SPATIAL, rates.dtype).rotation(), none, none
-    return jax.lax.scan(one, start, (seconds, rates))[0]
+    return jax.lax.scan(one, start, (seconds, rates, forces))[0]
 
 
-def _two_polynomials(
-    seconds: Float[Array, " m"],
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Orthonormal functions of time of degree 0 and 1: `∫ φ_i φ_j dt = δ_ij`."""
-    total = jnp.sum(seconds)
+def _slope(seconds: Float[Array, " m"], total: Scalar) -> Float[Array, " m"]:
+    """The straight line in time φ with `∫ φ dt = 0` and `∫ φ² dt = 1`; 0 for one reading."""
     middle = jnp.cumsum(seconds) - seconds / 2 - total / 2
     size = jnp.sum(seconds * middle**2)
-    mean = jnp.where(total > 0, 1 / jnp.sqrt(jnp.where(total > 0, total, 1.0)), 0.0)
-    slope = jnp.where(size > 0, 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
-    return jnp.full_like(seconds, mean), slope * middle
+    return jnp.where(size > 0, middle / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
 
 
 class Imu(AbstractMotion):
@@ -298,7 +303,7 @@ class Imu(AbstractMotion):
         still = replace(self.still(rates.dtype), seconds=self.readings * seconds)
 
         def without_errors(rates):
-            turned, sped, moved = _integrated(at, rates)
+            turned, sped, moved = _integrated(at, rates[:, :3], rates[:, 3:])
             return replace(still, turned=turned, sped=sped, moved=moved)
 
         exact = jax.vmap(without_errors)(of_steps(rates))
