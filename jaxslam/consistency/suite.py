@@ -46,6 +46,8 @@ class SuiteScenario:
         so have no numbers.
         """
         s, axes = self.scenario, AXES[self.scenario.geometry.name]
+        if s.inertial:
+            raise ValueError(f"{s.name}: --suite has no table of inertial readings")
         if not isinstance(s.sensor, Pinhole) or s.beacons:
             has = "beacons" if s.beacons else f"a {type(s.sensor).__name__} sensor"
             raise ValueError(f"{s.name} has {has}; --suite supports cameras only, without beacons")

@@ -380,6 +380,7 @@ class World(eqx.Module):
         for kind, known in (("motion", MOTIONS), ("sensor", SENSORS)):
             piece = getattr(self, kind)
             word = {made: word for word, made in known.items()}.get(type(piece), "")
+            word = word if _says_all(PLACES.get(word, {}), piece) else ""
             found[kind] = word or piece
             pieces[word] = piece
         for word, piece in pieces.items():
@@ -410,6 +411,14 @@ def _flat(piece: eqx.Module | None, places: Mapping[str, str]) -> dict[str, Valu
         with suppress(AttributeError):  # a lens, where there is none
             found[field] = _numbers_of(attrgetter(place)(piece))
     return {field: value for field, value in found.items() if value is not None}
+
+
+def _says_all(places: Mapping[str, str], piece: eqx.Module) -> bool:
+    """Whether what a piece has beside these places is as it is by default."""
+    said = {place.partition(".")[0] for place in places.values()}
+    others = [field for field in dataclasses.fields(piece) if field.name not in said]
+    values = [(_numbers_of(getattr(piece, field.name)), field.default) for field in others]
+    return all(value == default for value, default in values if not isinstance(value, Tracer))
 
 
 def _numbers_of(value: Value) -> Value:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -964,3 +964,36 @@ def test_landmarks_that_share_slots_are_new_when_they_come_back():
 def test_worlds_that_are_seen_again_are_checked(fields, message):
     with pytest.raises(ValueError, match=message):
         scenario("matched", fields)
+
+
+def test_what_no_field_says_of_an_inertial_unit_stays_when_others_change():
+    plain = scenario("imu", steps=7)
+    assert (plain.fields["motion"], plain.motion.readings) == ("imu", 40)
+    mounted = np.diag([1.0, -1.0, -1.0, 1.0])
+    world = scenario("imu", motion=dataclasses.replace(plain.motion, camera_from_imu=mounted))
+    changed = scenario(world, steps=5)
+    assert changed.steps == 5
+    np.testing.assert_array_equal(changed.motion.camera_from_imu, mounted)
+    np.testing.assert_array_equal(changed.motion.density, plain.motion.density)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"sway": [0.1] * 3}, r"the sway of a world has shape \(3,\); it needs \(6,\)"),
+        ({"motion": "velocity"}, "sway: not of a ConstantVelocity; use 0"),
+        ({"trajectory": "x.txt", "still_frames": 3}, "still_frames: not with an Imu along a"),
+    ],
+)
+def test_worlds_that_no_inertial_unit_has_are_refused(fields, told):
+    with pytest.raises(ValueError, match=told):
+        scenario("imu", **fields)
+
+
+def test_a_unit_that_first_stands_still_reads_no_motion():
+    run = quick_jit(partial(simulate, scenario("imu", steps=6, still_frames=4, landmarks=2)))(
+        jax.random.key(1)
+    )
+    away = np.linalg.norm(run.poses.translation(), axis=1)
+    assert away[:5].max() < 1e-7
+    assert away[6] > 1e-5
