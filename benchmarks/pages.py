@@ -69,6 +69,14 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         ]
         return [x for x in (*found, one["rmse"], one["published_rmse"]) if x is not None]
 
+    def along(trajectory: str, name: str) -> list[float]:
+        """Of a filter with an inertial unit: NEES per degree of freedom and its interval, of
+        orientation and position, in the first third and at the end; the RMSE there; the lost."""
+        row = files["inertial"][trajectory][name]
+        parts = [row[part] for part in ("orientation", "position")]
+        found = [x for part in parts for of in ("first", "end") for x in part[of]]
+        return [*found, *(part["rmse"] for part in parts), row["lost"]]
+
     def observed(scenario: str, name: str) -> list[float]:
         """The numbers of a row of the table about observability."""
         one = files["observability"]["scenarios"][scenario][f"{name}/inverse_scaling"]
@@ -109,8 +117,8 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         return found["microseconds_per_step"]
 
     functions = (
-        row, mean, sigma, lost, end, step, theirs, observed, initialised, walked, accused, cautious,
-        shown, on_gpu,
+        row, mean, sigma, lost, end, step, theirs, along, observed, initialised, walked, accused,
+        cautious, shown, on_gpu,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 
