@@ -15,6 +15,8 @@ from jaxslam.filters.gate import Gate
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.recommended import recommended
+from jaxslam.filters.remedies.decoupled import DecoupledInvariant
+from jaxslam.filters.remedies.fej2 import ProjectedFirstEstimates
 from jaxslam.filters.remedies.first_estimates import FirstEstimates
 from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
@@ -55,6 +57,12 @@ def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
     return replace(slam, depth=replace(slam.depth, common=percent / 100))
 
 
+def _with_first_estimates(slam: Slam, kind: int = 1) -> Slam:
+    if kind not in (1, 2):
+        raise ValueError(f"modifier fej takes no number but 2, not {kind}")
+    return replace(slam, correction=FirstEstimates() if kind == 1 else ProjectedFirstEstimates())
+
+
 def _iterated(slam: Slam, steps: int = 5) -> Slam:
     if not hasattr(slam.correction, "steps"):
         raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton in an update")
@@ -74,7 +82,8 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
     "walk": lambda slam, percent=3: replace(slam, depth=replace(slam.depth, walk=percent / 100)),
-    "fej": lambda slam: replace(slam, correction=FirstEstimates()),
+    "fej": _with_first_estimates,
+    "decoupled": lambda slam: replace(slam, correction=DecoupledInvariant()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
     "drift": lambda slam, percent=10: replace(
@@ -95,7 +104,7 @@ recommended mixture. The number that may follow the name is
 - `scene`: σ of an error that is common to all priors on depth, in percent of one landmark's;
 - `walk`: σ by which that error, which it needs, changes from frame to frame, in percent of the
   same;
-- `fej`: none;
+- `fej`: 2 for FEJ2, which leaves out what first estimates get wrong; `decoupled`: none;
 - `oc`, `iterated`: the steps of Gauss–Newton in an update;
 - `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;
 - `directions`: the members of a Gaussian sum; `mixture`: the most members of one that is split;
@@ -132,7 +141,7 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
 
 _ORDER = list(MODIFIERS)
 _ONE_OF = {
-    "correction": ("invariant", "fej", "oc"),
+    "correction": ("invariant", "fej", "oc", "decoupled"),
     "sum of Gaussians": ("directions", "mixture"),
     "delayed initialisation": ("particles", "rays"),
 }
@@ -156,7 +165,7 @@ def _parsed(modifier: str) -> tuple[str, list[int]]:
         )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
-    if number and word == "fej":
+    if number and word == "decoupled":
         raise ValueError(f"modifier {word} takes no number, not {number}")
     return word, [int(number)] if number else []
 
