@@ -72,7 +72,9 @@ class Study:
     theirs: dict[str, tuple[float | None, ...] | None]
     """By filter the value of every quantity; None where only ours exists."""
     every: int = 1
-    """A measurement is in one frame of so many."""
+    """Measurements are in one frame of so many, the first of which is the start."""
+    batch: int | None = 25
+    """Runs in one batch; None where a map is so large that one after another is faster."""
 
 
 UKFM = {
@@ -147,7 +149,11 @@ def affine(odometry: float, position: float) -> World:
 
 STUDIES = {
     "room": Study(
-        SLAMTB, partial(scenario, "room"), 25, 100, ROOM,
+        SLAMTB,
+        partial(scenario, "room"),
+        25,
+        100,
+        ROOM,
         {
             "world/inverse_depth": (6.99, 6.57, 6.88, 0.082),
             "world/anchored_homogeneous": (7.00, 6.54, 6.83, 0.082),
@@ -158,7 +164,11 @@ STUDIES = {
         },
     ),
     "positions": Study(
-        HUANG, partial(scenario, "positions"), 100, 300, POSITIONS,
+        HUANG,
+        partial(scenario, "positions"),
+        100,
+        300,
+        POSITIONS,
         {
             "world/cartesian": (4.77, 6.35),
             "robocentric/cartesian": (3.09, 3.37),
@@ -170,7 +180,11 @@ STUDIES = {
         },
     ),
     "positions-loose": Study(
-        HUANG, partial(scenario, "positions-loose"), 100, 300, POSITIONS,
+        HUANG,
+        partial(scenario, "positions-loose"),
+        100,
+        300,
+        POSITIONS,
         {
             "world/cartesian": (19.1, 29.9),
             "robocentric/cartesian": (5.11, 6.91),
@@ -182,14 +196,22 @@ STUDIES = {
         },
     ),
     "ukfm-slam2d": Study(
-        "ukfm (Brossard)", partial(scenario, "positions", UKFM), 100, 200, of_parts(10),
+        "ukfm (Brossard)",
+        partial(scenario, "positions", UKFM),
+        100,
+        200,
+        of_parts(10),
         {
             "world/cartesian": (2.88, 2.56, 3.02, 0.67),
             "invariant/cartesian": (1.01, 1.17, 2.51, 0.55),
         },
     ),
     "ukfm-localisation": Study(
-        "ukfm (Brossard)", localisation, 100, 400, of_parts(2000),
+        "ukfm (Brossard)",
+        localisation,
+        100,
+        400,
+        of_parts(2000),
         {
             "world/cartesian": (4.91, 275.28, 12.00, 0.76),
             "left-invariant/cartesian": (1.00, 2.02, 11.35, 0.45),
@@ -197,7 +219,11 @@ STUDIES = {
         every=100,
     ),
     "zhang-1": Study(
-        RAL, partial(zhang, 0.01), 100, 16, ZHANG,
+        RAL,
+        partial(zhang, 0.01),
+        100,
+        8,
+        ZHANG,
         {
             "invariant/cartesian": (0.25, 0.0058, 1.02, 1.01),
             "world+fej/cartesian": (0.29, 0.0071, 1.12, 1.14),
@@ -205,9 +231,14 @@ STUDIES = {
             "robocentric, composed first/cartesian": (0.31, 0.0060, 1.04, 1.15),
             **BESIDE,
         },
+        batch=None,
     ),
     "zhang-5": Study(
-        RAL, partial(zhang, 0.05), 100, 16, ZHANG,
+        RAL,
+        partial(zhang, 0.05),
+        100,
+        8,
+        ZHANG,
         {
             "invariant/cartesian": (1.16, 0.027, 1.0, 1.01),
             "world+fej/cartesian": (1.24, 0.029, 1.05, 1.13),
@@ -215,6 +246,7 @@ STUDIES = {
             "robocentric, composed first/cartesian": (2.4, 0.041, 3.0, 7.5),
             **BESIDE,
         },
+        batch=None,
     ),
     "affine": Study(SONG, partial(affine, 0.01, 0.1), 50, 50, ZHANG[2:], AFFINE_FILTERS),
     "affine-far": Study(SONG, partial(affine, 0.01, 0.2), 50, 50, ZHANG[2:], AFFINE_FILTERS),
@@ -233,28 +265,29 @@ class Tables(Benchmark):
 
     studies: tuple[str, ...] = tuple(STUDIES)
     """Which of them; the file keeps the others."""
+    filters: tuple[str, ...] = ()
+    """Only these rows, `filter/landmarks`; all by default."""
     runs: int | None = None
     """Runs of every filter; by default, what the study says."""
     seed: int = 1
-    chunk: int = 4
-    """Runs in one batch: few, since a map of 300 points is large."""
     out: Path = RESULTS / "published.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
-        """`{"seed": …, "rows": [{study, filter, quantity, ours, theirs, …}]}`, after every one."""
+        """`{"rows": [{study, filter, quantity, ours, theirs, …}]}`, after every filter."""
         found = self.found().get("rows", []) if self.out.exists() else []
         for name in self.studies:
             study = STUDIES[name]
             study = study if self.runs is None else replace(study, runs=self.runs)
             batch = draw(study.world(), study.runs, seed=self.seed)
-            for filter_name in study.theirs:
+            for filter_name in (x for x in study.theirs if x in (self.filters or study.theirs)):
                 start = time.perf_counter()
-                records = errors(filter_name, study, batch, self.chunk)
+                records = errors(filter_name, study, batch)
                 seconds = (time.perf_counter() - start) / study.runs
                 found = [x for x in found if (x["study"], x["filter"]) != (name, filter_name)]
                 rows = compared(study, filter_name, records)
-                found += [{"study": name, **row, "seconds_per_run": seconds} for row in rows]
-                yield {"seed": self.seed, "rows": sorted(found, key=_place)}
+                beside = {"study": name, "seed": self.seed, "seconds_per_run": round(seconds, 3)}
+                found += [beside | row for row in rows]
+                yield {"rows": sorted(found, key=_place)}
 
     def report(self, results: dict[str, Any]) -> None:
         page = self.docs / "rivals.md"
@@ -267,13 +300,13 @@ def _place(row: dict[str, Any]) -> tuple[int, int]:
     return list(STUDIES).index(row["study"]), list(study.theirs).index(row["filter"])
 
 
-def errors(name: str, study: Study, batch: tuple, chunk: int) -> dict[str, np.ndarray]:
+def errors(name: str, study: Study, batch: tuple) -> dict[str, np.ndarray]:
     """Of every run and step NEES by its degrees of freedom, and the squares of the errors."""
     slam = make(name, study.world())
     room, runs = batch
-    frames = np.arange(runs.visible.shape[1]) - (study.every > 1)  # their step 0 is our first one
-    seen = (frames % study.every == 0)[None, :, None] & (study.every == 1 or frames > 0)[..., None]
-    runs = replace(runs, visible=runs.visible & seen)
+    frames = np.arange(runs.visible.shape[1])
+    seen = (study.every == 1) | ((frames > 1) & ((frames - 1) % study.every == 0))
+    runs = replace(runs, visible=runs.visible & seen[None, :, None])
 
     def told(state, innovation, frame):
         estimate, P = jaxslam.camera_pose(slam, state)
@@ -286,13 +319,11 @@ def errors(name: str, study: Study, batch: tuple, chunk: int) -> dict[str, np.nd
         found = dict(zip(("pose", "orientation", "position"), nees, strict=True))
         return found | {"turn": jnp.sum(turned**2), "distance": jnp.sum(moved**2)}
 
-    one = partial(run_through, slam, room, output=told)
-    program = jax.jit(jax.vmap(lambda run: one(run)[1]))
-    parts = []
-    for i in range(0, study.runs, chunk):
-        part = jax.tree.map(lambda x, i=i: x[np.arange(i, i + chunk) % study.runs], runs)
-        parts.append(jax.device_get(program(part)))
-    return {key: np.concatenate([p[key] for p in parts])[: study.runs] for key in parts[0]}
+    def one(run):
+        return run_through(slam, room, run, told)[1]
+
+    program = jax.jit(lambda runs: jax.lax.map(one, runs, batch_size=study.batch))
+    return jax.device_get(program(runs))
 
 
 def compared(study: Study, name: str, records: dict[str, np.ndarray]) -> Iterator[dict[str, Any]]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxslam.filters.gaussian import append_noise, noise_of
 from jaxslam.filters.linear.covariance import composed
 from jaxslam.filters.model import COMPOSED, Context
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filters, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, exp, joined
@@ -203,7 +204,7 @@ def left_invariant(**pieces) -> Slam:
 OWN = {"robocentric, composed first": ComposedFirst, "left-invariant": left_invariant}
 
 
-def make(name: str, world: World) -> Slam:
+def make(name: str, world: World) -> AbstractFilter:
     """A filter by its name in the tables, `filter/landmarks`."""
     frame, _, landmark = name.partition("/")
     if frame in OWN:

@@ -57,12 +57,6 @@ def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
     return replace(slam, depth=replace(slam.depth, common=percent / 100))
 
 
-def _with_first_estimates(slam: Slam, kind: int = 1) -> Slam:
-    if kind not in (1, 2):
-        raise ValueError(f"modifier fej takes no number but 2, not {kind}")
-    return replace(slam, correction=FirstEstimates() if kind == 1 else ProjectedFirstEstimates())
-
-
 def _iterated(slam: Slam, steps: int = 5) -> Slam:
     if not hasattr(slam.correction, "steps"):
         raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton in an update")
@@ -82,7 +76,8 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
     "walk": lambda slam, percent=3: replace(slam, depth=replace(slam.depth, walk=percent / 100)),
-    "fej": _with_first_estimates,
+    "fej": lambda slam: replace(slam, correction=FirstEstimates()),
+    "fej2": lambda slam: replace(slam, correction=ProjectedFirstEstimates()),
     "decoupled": lambda slam: replace(slam, correction=DecoupledInvariant()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
@@ -104,7 +99,7 @@ recommended mixture. The number that may follow the name is
 - `scene`: σ of an error that is common to all priors on depth, in percent of one landmark's;
 - `walk`: σ by which that error, which it needs, changes from frame to frame, in percent of the
   same;
-- `fej`: 2 for FEJ2, which leaves out what first estimates get wrong; `decoupled`: none;
+- `fej`, `fej2`, `decoupled`: none;
 - `oc`, `iterated`: the steps of Gauss–Newton in an update;
 - `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;
 - `directions`: the members of a Gaussian sum; `mixture`: the most members of one that is split;
@@ -141,7 +136,7 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
 
 _ORDER = list(MODIFIERS)
 _ONE_OF = {
-    "correction": ("invariant", "fej", "oc", "decoupled"),
+    "correction": ("invariant", "fej", "fej2", "oc", "decoupled"),
     "sum of Gaussians": ("directions", "mixture"),
     "delayed initialisation": ("particles", "rays"),
 }
@@ -158,14 +153,14 @@ def _check_one_of_each(words: list[str]) -> None:
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
-    word = modifier.rstrip("0123456789")
+    word = modifier if modifier in MODIFIERS else modifier.rstrip("0123456789")
     if word in _LEFT:
         raise ValueError(
             f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}"
         )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
-    if number and word == "decoupled":
+    if number and word in ("fej", "decoupled"):
         raise ValueError(f"modifier {word} takes no number, not {number}")
     return word, [int(number)] if number else []
 

@@ -29,12 +29,12 @@ class ProjectedFirstEstimates(AbstractFirstEstimates):
 
     name: ClassVar[str] = "fej2"
 
-    def noise(self, model, state, features, noise, context):
+    def noise(self, model, state, seen, R, at):
         first = replace(state, landmarks=state.first)
-        _, in_front, H = observe(model, state, features.slots, context)
-        _, was_in_front, H_first = observe(model, first, features.slots, context)
-        used = features.valid & in_front & was_in_front & state.active[features.slots]
-        R = noise_matrix(noise, used)
+        _, in_front, H = observe(model, state, seen.slots, at)
+        _, was_in_front, H_first = observe(model, first, seen.slots, at)
+        used = seen.valid & in_front & was_in_front & state.active[seen.slots]
+        R = noise_matrix(R, used)
         D = masked(H, used).by_view - masked(H_first, used).by_view
         D = (D @ H.view_by_core).reshape(len(R), -1)
         without_bound = jnp.trace(R) / len(R) / jnp.sqrt(jnp.finfo(R.dtype).eps)

@@ -41,12 +41,10 @@ class AbstractFirstEstimates(AbstractCorrection):
         after = replace(after, landmarks=state.landmarks + correction)
         return after, replace(innovation, predicted=predicted)
 
-    def noise(
-        self, model: SlamModel, state: State, features: Features, noise: Noise, context: Context
-    ) -> Noise:
+    def noise(self, model: SlamModel, state: State, seen: Features, R: Noise, at: Context) -> Noise:
         """R, with what the Jacobians of the first estimates leave out."""
-        del model, state, features, context
-        return noise
+        del model, state, seen, at
+        return R
 
     def corrected(self, model: SlamModel, before: State, after: State) -> Core:
         """The core `before` the update with its correction, which `after` has added."""
