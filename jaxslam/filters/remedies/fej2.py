@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jaxslam.filters.linear.blocks import masked, observe
 from jaxslam.filters.linear.kalman import noise_matrix
 from jaxslam.filters.remedies.first_estimates import AbstractFirstEstimates
-from jaxslam.filters.remedies.transport import left_inverse
 
 
 class ProjectedFirstEstimates(AbstractFirstEstimates):
@@ -37,5 +36,7 @@ class ProjectedFirstEstimates(AbstractFirstEstimates):
         R = noise_matrix(R, used)
         D = masked(H, used).by_view - masked(H_first, used).by_view
         D = (D @ H.view_by_core).reshape(len(R), -1)
+        length = jnp.linalg.norm(D, axis=0)
+        D = D / jnp.where(length > 0, length, 1.0)
         without_bound = jnp.trace(R) / len(R) / jnp.sqrt(jnp.finfo(R.dtype).eps)
-        return R + without_bound * D @ left_inverse(D)
+        return R + without_bound * D @ D.T
