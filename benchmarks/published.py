@@ -336,7 +336,7 @@ def compared(study: Study, name: str, records: dict[str, np.ndarray]) -> Iterato
     theirs = study.theirs[name] or (None,) * len(study.quantities)
     for quantity, published in zip(study.quantities, theirs, strict=True):
         of = records[quantity.of][healthy]
-        low, high = np.quantile(quantity.value(of, as_theirs), [0.025, 0.975])
+        low, high = map(_rounded, np.quantile(quantity.value(of, as_theirs), [0.025, 0.975]))
         yield {
             "source": study.source,
             "filter": name,
@@ -346,7 +346,7 @@ def compared(study: Study, name: str, records: dict[str, np.ndarray]) -> Iterato
             "ours": _rounded(quantity.value(of, np.full((1, count), 1 / count))[0]),
             "our_runs": study.runs,
             "diverged": study.runs - count,
-            "interval95": [_rounded(low), _rounded(high)],
+            "interval95": [low, high],
             "within": None if published is None else bool(low <= published <= high),
         }
 
