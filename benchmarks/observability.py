@@ -30,6 +30,8 @@ class Observability(Benchmark):
         "world/inverse_scaling",
         "world+oc/inverse_scaling",
         "world+fej/inverse_scaling",
+        "world+fej2/inverse_scaling",
+        "world+decoupled/inverse_scaling",
         "invariant/inverse_scaling",
         "robocentric/inverse_depth",
         "robocentric+oc/inverse_depth",

@@ -58,16 +58,15 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
         return own / paper
 
-    def theirs(scenario: str, name: str) -> list[float]:
-        """Of each window of steps NEES and its interval, and the published value if there is one;
-        then the RMSE, and theirs."""
-        one = files["published"][scenario]["filters"][name]
-        found = [
-            x
-            for window in one["nees"].values()
-            for x in (window["ours"], *window["interval95"], window.get("published"))
-        ]
-        return [x for x in (*found, one["rmse"], one["published_rmse"]) if x is not None]
+    def theirs(study: str, name: str) -> list[float]:
+        """Our values beside those of a published table, quantity by quantity."""
+        rows = files["published"]["rows"]
+        return [x["ours"] for x in rows if (x["study"], x["filter"]) == (study, name)]
+
+    def told() -> list[int]:
+        """How many published values there are, and how many are within our interval."""
+        within = [x["within"] for x in files["published"]["rows"] if x["theirs"] is not None]
+        return [len(within), sum(within)]
 
     def along(trajectory: str, name: str) -> list[float]:
         """Of a filter with an inertial unit: NEES per degree of freedom and its interval, of
@@ -117,8 +116,8 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         return found["microseconds_per_step"]
 
     functions = (
-        row, mean, sigma, lost, end, step, theirs, along, observed, initialised, walked, accused,
-        cautious, shown, on_gpu,
+        row, mean, sigma, lost, end, step, theirs, told, along, observed, initialised, walked,
+        accused, cautious, shown, on_gpu,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 

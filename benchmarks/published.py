@@ -1,11 +1,11 @@
 """Other people's published numbers out of this library, on their own settings.
 
-    python benchmarks/published.py comparisons
-    python benchmarks/published.py ukfm
+    python benchmarks/published.py tables
+    python benchmarks/published.py tables --studies zhang-1 zhang-5
     python benchmarks/published.py navlie runs.npz --generate
     python benchmarks/published.py navlie runs.npz
 
-Ours are printed beside theirs.
+A row of the results is a published number beside ours.
 """
 
 from __future__ import annotations
@@ -14,285 +14,358 @@ import importlib
 import importlib.util
 import math
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table
+from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from published_worlds import localisation, make, zhang
 from tyro.conf import Positional
 
 import jaxslam
 from jaxslam.consistency import draw, run_through
-from jaxslam.evaluation.convention import Convention, converted, pose_errors
+from jaxslam.evaluation.convention import Convention
+from jaxslam.geometry import log
+from jaxslam.simulation import World, scenario
+from jaxslam.statistics.bands import normalised_squared
 
-ROOM_WINDOWS = {"1–50": slice(0, 50), "51–100": slice(50, 100), "101–200": slice(100, 200)}
-# Their step 1 is our step 1; both leave out the start, which has no error.
-POSITION_WINDOWS = {"all": slice(0, 400), "last 50": slice(350, 400)}
+MARK = "<!-- published.py -->"
+RESAMPLED = 4000
+"""Samples of runs of which an interval is made."""
+
+
+class Quantity(NamedTuple):
+    """A number of a published table: a mean over runs and steps."""
+
+    told: str
+    of: str
+    """Which of `errors` it is."""
+    steps: slice = slice(None)
+    factor: float = 1.0
+    mean: str = "plain"
+    """`plain`; `rms` over runs, then plain over steps; `quadratic`: rms over both."""
+
+    def value(self, records: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """It, for so many samples of runs, each of which counts by its weight."""
+        by_step = weights @ records[:, self.steps]
+        by_step = np.sqrt(by_step) if self.mean == "rms" else by_step
+        found = by_step.mean(axis=-1)
+        return self.factor * (np.sqrt(found) if self.mean == "quadratic" else found)
 
 
 @dataclass(frozen=True)
-class Published:
-    """A table of somebody else's: mean pose NEES by window of steps, and RMSE at the end, m."""
+class Study:
+    """Published tables of one world."""
 
-    scenario: str
+    source: str
+    world: Callable[[], World]
+    their_runs: int
     runs: int
-    windows: dict[str, slice]
-    nees: dict[str, tuple[float, ...] | None]
-    """By filter; None where only ours exists."""
-    rmse: dict[str, float]
+    """Ours."""
+    quantities: tuple[Quantity, ...]
+    theirs: dict[str, tuple[float | None, ...] | None]
+    """By filter the value of every quantity; None where only ours exists."""
+    every: int = 1
+    """Measurements are in one frame of so many, the first of which is the start."""
+    batch: int | None = 25
+    """Runs in one batch; None where a map is so large that one after another is faster."""
 
 
-TABLES = (
-    Published(
-        scenario="room",
-        runs=25,
-        windows=ROOM_WINDOWS,
-        nees={
-            "world/inverse_depth": (6.99, 6.57, 6.88),
-            "world/anchored_homogeneous": (7.00, 6.54, 6.83),
-            "world/inverse_depth_to_cartesian": (7.01, 6.45, 6.95),
-            "world/unit_homogeneous": (15.4, 56.2, 151.0),
-            "robocentric/unit_homogeneous": None,
-            "robocentric/inverse_scaling": None,
-        },
-        rmse={
-            "world/inverse_depth": 0.082,
-            "world/anchored_homogeneous": 0.082,
-            "world/inverse_depth_to_cartesian": 0.078,
-            "world/unit_homogeneous": 0.113,
-        },
-    ),
-    Published(
-        scenario="positions",
-        runs=100,
-        windows=POSITION_WINDOWS,
-        nees={
-            "world/cartesian": (4.77, 6.35),
-            "robocentric/cartesian": (3.09, 3.37),
-            "world+oc/cartesian": (3.10, 3.35),
-            "world+fej/cartesian": None,
-            "invariant/cartesian": (3.10, 3.33),
-        },
-        rmse={},
-    ),
-    Published(
-        scenario="positions-loose",
-        runs=100,
-        windows=POSITION_WINDOWS,
-        nees={
-            "world/cartesian": (19.1, 29.9),
-            "robocentric/cartesian": (5.11, 6.91),
-            "world+oc/cartesian": (5.21, 7.02),
-            "world+fej/cartesian": None,
-            "invariant/cartesian": (5.01, 6.62),
-        },
-        rmse={},
-    ),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparisons(Benchmark):
-    """The scenarios `room` (slamtb, Solà's EKF-SLAM toolbox in MATLAB) and `positions` (2-D SLAM of
-    Huang, Mourikis and Roumeliotis, IJRR 2010, in the settings of Barrau and Bonnabel).
-
-    Theirs are means over few runs, so ours come with the interval in which 95 % of the means of
-    that many of our runs lie.
-    """
-
-    scenarios: tuple[str, ...] = ("room", "positions", "positions-loose")
-    """Which of the tables."""
-    filters: tuple[str, ...] = ()
-    """Only these rows, `filter/landmarks`; the file keeps its others. All by default."""
-    runs: int = 1000
-    """Runs of every filter."""
-    seed: int = 0
-    chunk: int = 10
-    """Runs in one batch: few, since a map of 72 points is large."""
-    out: Path = RESULTS / "published.json"
-
-    def measure(self) -> Iterator[dict[str, Any]]:
-        """`{scenario: {"filters": {"filter/landmarks": numbers}, …}}`, after every filter."""
-        results = self.found()
-        for theirs in (t for t in TABLES if t.scenario in self.scenarios):
-            dof = jaxslam.scenario(theirs.scenario).geometry.tangent_dim
-            kept = results.get(theirs.scenario, {}).get("filters", {}) if self.filters else {}
-            results[theirs.scenario] = {
-                "seed": self.seed,
-                "published_runs": theirs.runs,
-                "band95_of_published_runs": jaxslam.mean_band(dof, theirs.runs),
-                "filters": kept,
-            }
-            for name in self.filters or theirs.nees:
-                if name in theirs.nees:
-                    kept[name] = _measure(theirs, name, self)
-                    yield results
-
-    def report(self, results: dict[str, Any]) -> None:
-        for theirs in (t for t in TABLES if t.scenario in results):
-            header = ["filter", *(f"NEES, steps {label}" for label in theirs.windows), "RMSE m"]
-            rows = [_line(*row) for row in results[theirs.scenario]["filters"].items()]
-            print(
-                f"\n{theirs.scenario}: ours [95 % of the means of {theirs.runs} runs] (published)"
-            )
-            print(table(header, rows), flush=True)
-
-
-def _measure(theirs: Published, name: str, options: Comparisons) -> dict[str, Any]:
-    """One filter, beside theirs."""
-    scenario = jaxslam.scenario(theirs.scenario)
-    frame, landmarks = name.split("/")
-    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
-    study = jaxslam.monte_carlo(
-        scenario, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
-    )
-    records = [study.store.load(name, chunk, ("nees", "error")) for chunk in study.chunks]
-    nees = np.concatenate([record["nees"] for record in records])
-    error = np.concatenate([record["error"] for record in records])
-    return _compared(theirs, nees, theirs.nees[name]) | {
-        "runs": options.runs,
-        "rmse": _rmse(error, scenario.geometry.point_dim),
-        "published_rmse": theirs.rmse.get(name),
-        "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
-        "seconds_per_run": round(study.seconds[name].run / options.runs, 4),
-    }
-
-
-def interval95(rng: np.random.Generator, by_run: np.ndarray, runs: int) -> np.ndarray:
-    """Where 95 % of the means of so many of these runs lie."""
-    means = [rng.choice(by_run, runs).mean() for _ in range(20_000)]
-    return np.quantile(means, [0.025, 0.975]).round(3)
-
-
-def _compared(table: Published, nees: np.ndarray, theirs: tuple[float, ...] | None) -> dict:
-    """Means of our runs by window, and where 95 % of the means of `table.runs` of them lie."""
-    healthy = nees[np.isfinite(nees).all(axis=1)]
-    rng = np.random.default_rng(0)
-    windows = {}
-    for i, (label, part) in enumerate(table.windows.items()):
-        by_run = healthy[:, part].mean(axis=1)
-        low, high = interval95(rng, by_run, table.runs)
-        windows[label] = {
-            "ours": round(by_run.mean(), 3),
-            "interval95": [low, high],
-        }
-        if theirs is not None:
-            windows[label] |= {"published": theirs[i], "within": bool(low <= theirs[i] <= high)}
-    return {"nees": windows}
-
-
-def _rmse(error: np.ndarray, n: int) -> float:
-    """Of the position at the last step."""
-    return round(float(np.sqrt((error[:, -1, :n] ** 2).sum(axis=-1).mean())), 4)
-
-
-def _line(name: str, row: dict[str, Any]) -> list[str]:
-    cells = [name]
-    for window in row["nees"].values():
-        low, high = window["interval95"]
-        theirs = f" ({window['published']})" if "published" in window else ""
-        cells.append(f"{window['ours']:.2f} [{low:.2f}, {high:.2f}]{theirs}")
-    theirs = f" ({row['published_rmse']})" if row["published_rmse"] else ""
-    return [*cells, f"{row['rmse']:.3f}{theirs}"]
-
-
-SPEED, TURN = 0.25, math.radians(1.5)
-UKFM_SETTING = {
+UKFM = {
     "steps": 2499,
-    "velocity": (0.0, SPEED, TURN),
+    "velocity": (0.0, 0.25, math.radians(1.5)),
     # Wheels do not slip sideways; a tenth of a millimetre keeps the covariance positive definite.
-    "odometry_sigma": (1e-4, 0.05 * SPEED / math.sqrt(2), 0.1 * SPEED * math.sqrt(2)),
+    "odometry_sigma": (1e-4, 0.05 * 0.25 / math.sqrt(2), 0.1 * 0.25 * math.sqrt(2)),
     "landmarks": 20,
-    "ring_radius": SPEED / TURN + 3.0,
+    "ring_radius": 0.25 / math.radians(1.5) + 3.0,
     "range": (1.0, 5.0),
     "position_sigma": 0.1,
 }
-UKFM_NEES = {"world/cartesian": (2.88, 2.56), "invariant/cartesian": (1.01, 1.17)}
-"""NEES/dof of orientation and position: their EKF and their invariant EKF, 100 runs."""
-FIRST = 10
-"""Steps that they leave out."""
-RIGHT, MIXED = Convention("right"), Convention("split", "mixed")
+AFFINE = {
+    "geometry": "spatial",
+    "motion": "odometry",
+    "sensor": "position",
+    "steps": 2000,
+    "rate": 1.0,
+    "velocity": (0.0, 0.0, 0.2356, 0.0, -2 * math.pi / 400, 0.0),
+    "placement": "ring",
+    "ring_radius": 16.5,
+    "landmarks": 50,
+    "range": (0.0, 5.0),
+}
+ROOM = (
+    Quantity("NEES, steps 1–50", "pose", slice(0, 50), 6),
+    Quantity("NEES, steps 51–100", "pose", slice(50, 100), 6),
+    Quantity("NEES, steps 101–200", "pose", slice(100, 200), 6),
+    Quantity("RMSE at the end, m", "distance", slice(-1, None), mean="quadratic"),
+)
+POSITIONS = (
+    Quantity("NEES, all steps", "pose", factor=3),
+    Quantity("NEES, last 50 steps", "pose", slice(350, 400), 3),
+)
+
+
+def of_parts(first: int) -> tuple[Quantity, ...]:
+    """ukfm's quantities, from a step on."""
+    steps = slice(first, None)
+    return (
+        Quantity("NEES of orientation", "orientation", steps),
+        Quantity("NEES of position", "position", steps),
+        Quantity("RMSE, °", "turn", slice(None), 180 / math.pi, "quadratic"),
+        Quantity("RMSE, m", "distance", slice(None), mean="quadratic"),
+    )
+
+
+ZHANG = (
+    Quantity("RMS of position, m", "distance", mean="rms"),
+    Quantity("RMS of orientation, rad", "turn", mean="rms"),
+    Quantity("NEES of orientation", "orientation"),
+    Quantity("NEES of pose", "pose"),
+)
+BESIDE = dict.fromkeys(
+    ("robocentric/cartesian", "world+oc/cartesian", "world+fej2/cartesian",
+     "world+decoupled/cartesian")
+)  # fmt: skip
+SLAMTB, HUANG = "slamtb (Solà)", "Barrau, Bonnabel 2015; Huang et al. 2010"
+RAL, SONG = "Zhang et al. 2017", "Song et al. 2024"
+AFFINE_FILTERS = dict.fromkeys(
+    f"{name}/cartesian"
+    for name in ("world", "world+fej", "world+fej2", "world+oc", "invariant", "world+decoupled",
+                 "robocentric")
+)  # fmt: skip
+
+
+def affine(odometry: float, position: float) -> World:
+    """The circle of Song et al. with another σ of translation and of a measured position."""
+    sigma = (odometry,) * 3 + (0.003,) * 3
+    return scenario("positions", {**AFFINE, "odometry_sigma": sigma, "position_sigma": position})
+
+
+STUDIES = {
+    "room": Study(
+        SLAMTB,
+        partial(scenario, "room"),
+        25,
+        100,
+        ROOM,
+        {
+            "world/inverse_depth": (6.99, 6.57, 6.88, 0.082),
+            "world/anchored_homogeneous": (7.00, 6.54, 6.83, 0.082),
+            "world/inverse_depth_to_cartesian": (7.01, 6.45, 6.95, 0.078),
+            "world/unit_homogeneous": (15.4, 56.2, 151.0, 0.113),
+            "robocentric/unit_homogeneous": None,
+            "robocentric/inverse_scaling": None,
+        },
+    ),
+    "positions": Study(
+        HUANG,
+        partial(scenario, "positions"),
+        100,
+        300,
+        POSITIONS,
+        {
+            "world/cartesian": (4.77, 6.35),
+            "robocentric/cartesian": (3.09, 3.37),
+            "world+oc/cartesian": (3.10, 3.35),
+            "invariant/cartesian": (3.10, 3.33),
+            "world+fej/cartesian": None,
+            "world+fej2/cartesian": None,
+            "world+decoupled/cartesian": None,
+        },
+    ),
+    "positions-loose": Study(
+        HUANG,
+        partial(scenario, "positions-loose"),
+        100,
+        300,
+        POSITIONS,
+        {
+            "world/cartesian": (19.1, 29.9),
+            "robocentric/cartesian": (5.11, 6.91),
+            "world+oc/cartesian": (5.21, 7.02),
+            "invariant/cartesian": (5.01, 6.62),
+            "world+fej/cartesian": None,
+            "world+fej2/cartesian": None,
+            "world+decoupled/cartesian": None,
+        },
+    ),
+    "ukfm-slam2d": Study(
+        "ukfm (Brossard)",
+        partial(scenario, "positions", UKFM),
+        100,
+        200,
+        of_parts(10),
+        {
+            "world/cartesian": (2.88, 2.56, 3.02, 0.67),
+            "invariant/cartesian": (1.01, 1.17, 2.51, 0.55),
+        },
+    ),
+    "ukfm-localisation": Study(
+        "ukfm (Brossard)",
+        localisation,
+        100,
+        400,
+        of_parts(2000),
+        {
+            "world/cartesian": (4.91, 275.28, 12.00, 0.76),
+            "left-invariant/cartesian": (1.00, 2.02, 11.35, 0.45),
+        },
+        every=100,
+    ),
+    "zhang-1": Study(
+        RAL,
+        partial(zhang, 0.01),
+        100,
+        8,
+        ZHANG,
+        {
+            "invariant/cartesian": (0.25, 0.0058, 1.02, 1.01),
+            "world+fej/cartesian": (0.29, 0.0071, 1.12, 1.14),
+            "world/cartesian": (0.32, 0.0065, 1.34, 1.35),
+            "robocentric, composed first/cartesian": (0.31, 0.0060, 1.04, 1.15),
+            **BESIDE,
+        },
+        batch=None,
+    ),
+    "zhang-5": Study(
+        RAL,
+        partial(zhang, 0.05),
+        100,
+        8,
+        ZHANG,
+        {
+            "invariant/cartesian": (1.16, 0.027, 1.0, 1.01),
+            "world+fej/cartesian": (1.24, 0.029, 1.05, 1.13),
+            "world/cartesian": (2.0, 0.043, 3.7, 3.1),
+            "robocentric, composed first/cartesian": (2.4, 0.041, 3.0, 7.5),
+            **BESIDE,
+        },
+        batch=None,
+    ),
+    "affine": Study(SONG, partial(affine, 0.01, 0.1), 50, 50, ZHANG[2:], AFFINE_FILTERS),
+    "affine-far": Study(SONG, partial(affine, 0.01, 0.2), 50, 50, ZHANG[2:], AFFINE_FILTERS),
+    "affine-fast": Study(SONG, partial(affine, 0.02, 0.1), 50, 50, ZHANG[2:], AFFINE_FILTERS),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ukfm(Benchmark):
-    """The table of ukfm's 2-D SLAM (Brossard, Barrau, Bonnabel, ICRA 2020) out of our filters.
+class Tables(Benchmark):
+    """Every published number that this library can give, beside its own.
 
-    Its setting is ten rounds on a circle of 2500 steps with 20 landmarks beside it; the NEES of
-    orientation and position by their degrees of freedom are means over all steps and runs. Poses
-    and covariances go through `jaxslam.evaluate`, orientation and position apart, as theirs do: the
-    position along the world's axes, its covariance that of the error `p − p̂` whatever the filter's
-    own error is.
+    Theirs are means over few runs, so ours come with the interval in which 95 % of the means of
+    that many runs are expected, by what our runs know: resampled twice, as many as ours, and of
+    these as many as theirs.
     """
 
-    runs: int = 100
-    """Runs of each filter."""
-    seed: int = 0
-    chunk: int = 25
-    """Runs in one batch."""
-    out: Path = RESULTS / "ukfm.json"
+    studies: tuple[str, ...] = tuple(STUDIES)
+    """Which of them; the file keeps the others."""
+    filters: tuple[str, ...] = ()
+    """Only these rows, `filter/landmarks`; all by default."""
+    runs: int | None = None
+    """Runs of every filter; by default, what the study says."""
+    seed: int = 1
+    out: Path = RESULTS / "published.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
-        results = {}
-        for name in UKFM_NEES:
-            results[name] = _of_parts(name, self)
-            yield {"runs": self.runs, "seed": self.seed, "filters": results, "ukfm": UKFM_NEES}
+        """`{"rows": [{study, filter, quantity, ours, theirs, …}]}`, after every filter."""
+        found = self.found().get("rows", []) if self.out.exists() else []
+        for name in self.studies:
+            study = STUDIES[name]
+            study = study if self.runs is None else replace(study, runs=self.runs)
+            batch = draw(study.world(), study.runs, seed=self.seed)
+            for filter_name in (x for x in study.theirs if x in (self.filters or study.theirs)):
+                start = time.perf_counter()
+                records = errors(filter_name, study, batch)
+                seconds = (time.perf_counter() - start) / study.runs
+                found = [x for x in found if (x["study"], x["filter"]) != (name, filter_name)]
+                rows = compared(study, filter_name, records)
+                beside = {"study": name, "seed": self.seed, "seconds_per_run": round(seconds, 3)}
+                found += [beside | row for row in rows]
+                yield {"rows": sorted(found, key=_place)}
 
     def report(self, results: dict[str, Any]) -> None:
-        rows = []
-        for name, found in results["filters"].items():
-            parts = zip((found["orientation"], found["position"]), UKFM_NEES[name], strict=True)
-            rows.append((name, *(_cell(part, theirs) for part, theirs in parts)))
-        header = "filter", "orientation, NEES/dof (theirs)", "position (theirs)"
-        print(table(header, rows), flush=True)
+        page = self.docs / "rivals.md"
+        if page.exists():
+            write_table(page, MARK, table_of(results["rows"]))
 
 
-def poses_of(name: str, options: Ukfm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimated poses (runs, steps, 3, 3), covariances of the right error, and the truth."""
-    scenario = jaxslam.scenario("positions", UKFM_SETTING)
-    slam = jaxslam.make_filters(scenario, [name.split("/")[0]], [name.split("/")[1]])[name]
-    room, runs = draw(scenario, options.runs, seed=options.seed)
+def _place(row: dict[str, Any]) -> tuple[int, int]:
+    study = STUDIES[row["study"]]
+    return list(STUDIES).index(row["study"]), list(study.theirs).index(row["filter"])
+
+
+def errors(name: str, study: Study, batch: tuple) -> dict[str, np.ndarray]:
+    """Of every run and step NEES by its degrees of freedom, and the squares of the errors."""
+    slam = make(name, study.world())
+    room, runs = batch
+    frames = np.arange(runs.visible.shape[1])
+    seen = (study.every == 1) | ((frames > 1) & ((frames - 1) % study.every == 0))
+    runs = replace(runs, visible=runs.visible & seen[None, :, None])
 
     def told(state, innovation, frame):
-        estimate, covariance = jaxslam.camera_pose(slam, state)
-        return estimate.as_matrix(), covariance, frame.pose.as_matrix()
+        estimate, P = jaxslam.camera_pose(slam, state)
+        n, R = estimate.translation().shape[-1], estimate.rotation().as_matrix()
+        moved = frame.pose.translation() - estimate.translation()
+        turned = log(estimate.rotation().inverse() @ frame.pose.rotation())
+        error, covariance = slam.pose_error(state, frame.pose)
+        parts = (error, covariance), (turned, P[n:, n:]), (moved, R @ P[:n, :n] @ R.T)
+        nees = (normalised_squared(*part) / part[0].size for part in parts)
+        found = dict(zip(("pose", "orientation", "position"), nees, strict=True))
+        return found | {"turn": jnp.sum(turned**2), "distance": jnp.sum(moved**2)}
 
-    one = partial(run_through, slam, room, output=told)
-    batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
-    parts = [
-        jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))
-        for i in range(0, options.runs, options.chunk)
-    ]
-    estimates, covariances, truths = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return estimates[:, FIRST:], covariances[:, FIRST:], truths[:, FIRST:]
+    def one(run):
+        return run_through(slam, room, run, told)[1]
+
+    program = jax.jit(lambda runs: jax.lax.map(one, runs, batch_size=study.batch))
+    return jax.device_get(program(runs))
 
 
-def _of_parts(name: str, options: Ukfm) -> dict:
-    """NEES/dof of orientation and of position, with the verdict on each."""
-    T, P, truth = poses_of(name, options)
-    P, errors = converted(P, T, RIGHT, MIXED), pose_errors(MIXED, T, truth)
-    result = {}
-    for part, axes in (("orientation", slice(2, 3)), ("position", slice(0, 2))):
-        found = jaxslam.evaluate(errors[..., axes], P[..., axes, axes])
-        nees = found.nees.mean(axis=1) / found.dof
-        interval = interval95(np.random.default_rng(0), nees, 100)
-        result[part] = {
-            "nees": round(float(nees.mean()), 3),
-            "interval95_of_100_runs": interval.tolist(),
-            "verdict": found.verdict["word"],
-            "sigma_factor": found.verdict["sigma_factor"],
+def compared(study: Study, name: str, records: dict[str, np.ndarray]) -> Iterator[dict[str, Any]]:
+    """The rows of a filter. What is not finite in a run leaves the run out, and is counted."""
+    judged = [records[quantity.of][:, quantity.steps] for quantity in study.quantities]
+    healthy = np.all([np.isfinite(of).all(axis=1) for of in judged], axis=0)
+    count, rng = int(healthy.sum()), np.random.default_rng(0)
+    ours = rng.multinomial(count, np.full(count, 1 / count), RESAMPLED)
+    as_theirs = rng.multinomial(study.their_runs, ours / count) / study.their_runs
+    theirs = study.theirs[name] or (None,) * len(study.quantities)
+    for quantity, published in zip(study.quantities, theirs, strict=True):
+        of = records[quantity.of][healthy]
+        low, high = map(_rounded, np.quantile(quantity.value(of, as_theirs), [0.025, 0.975]))
+        yield {
+            "source": study.source,
+            "filter": name,
+            "quantity": quantity.told,
+            "theirs": published,
+            "their_runs": study.their_runs,
+            "ours": _rounded(quantity.value(of, np.full((1, count), 1 / count))[0]),
+            "our_runs": study.runs,
+            "diverged": study.runs - count,
+            "interval95": [low, high],
+            "within": None if published is None else bool(low <= published <= high),
         }
-    whole = jaxslam.evaluate_poses(T, P, truth, MIXED)
-    return result | {"identified": str(whole.identified and whole.identified.convention)}
 
 
-def _cell(part: dict, theirs: float) -> str:
-    low, high = part["interval95_of_100_runs"]
-    return f"{part['nees']:.2f} [{low:.2f}, {high:.2f}] ({theirs})"
+def _rounded(value: float) -> float:
+    """Four digits."""
+    return float(f"{value:.4g}")
+
+
+def table_of(rows: list[dict[str, Any]]) -> str:
+    """The published values and ours."""
+    lines = []
+    for row in rows:
+        low, high = row["interval95"]
+        theirs = "–" if row["theirs"] is None else f"{row['theirs']:g}"
+        theirs = theirs if row["within"] in (None, True) else f"**{theirs}**"
+        ours = f"{row['ours']:.3g} [{low:.3g}, {high:.3g}]"
+        lines.append((row["study"], row["filter"], row["quantity"], theirs, ours, row["our_runs"]))
+    return table(("study", "filter", "quantity", "theirs", "ours [95 %]", "runs"), lines)
 
 
 ANCHORS = ((1, 0, 0), (-1, 0, 0), (0, 2, 0), (0, 2, 2))
@@ -377,4 +450,4 @@ class Navlie(Benchmark):
 
 
 if __name__ == "__main__":
-    run_one(Comparisons, Ukfm, Navlie)
+    run_one(Tables, Navlie)

@@ -15,6 +15,8 @@ from jaxslam.filters.gate import Gate
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.recommended import recommended
+from jaxslam.filters.remedies.decoupled import DecoupledInvariant
+from jaxslam.filters.remedies.fej2 import ProjectedFirstEstimates
 from jaxslam.filters.remedies.first_estimates import FirstEstimates
 from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
@@ -75,6 +77,8 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
     "walk": lambda slam, percent=3: replace(slam, depth=replace(slam.depth, walk=percent / 100)),
     "fej": lambda slam: replace(slam, correction=FirstEstimates()),
+    "fej2": lambda slam: replace(slam, correction=ProjectedFirstEstimates()),
+    "decoupled": lambda slam: replace(slam, correction=DecoupledInvariant()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
     "drift": lambda slam, percent=10: replace(
@@ -95,7 +99,7 @@ recommended mixture. The number that may follow the name is
 - `scene`: σ of an error that is common to all priors on depth, in percent of one landmark's;
 - `walk`: σ by which that error, which it needs, changes from frame to frame, in percent of the
   same;
-- `fej`: none;
+- `fej`, `fej2`, `decoupled`: none;
 - `oc`, `iterated`: the steps of Gauss–Newton in an update;
 - `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;
 - `directions`: the members of a Gaussian sum; `mixture`: the most members of one that is split;
@@ -132,7 +136,7 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
 
 _ORDER = list(MODIFIERS)
 _ONE_OF = {
-    "correction": ("invariant", "fej", "oc"),
+    "correction": ("invariant", "fej", "fej2", "oc", "decoupled"),
     "sum of Gaussians": ("directions", "mixture"),
     "delayed initialisation": ("particles", "rays"),
 }
@@ -149,14 +153,14 @@ def _check_one_of_each(words: list[str]) -> None:
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
-    word = modifier.rstrip("0123456789")
+    word = modifier if modifier in MODIFIERS else modifier.rstrip("0123456789")
     if word in _LEFT:
         raise ValueError(
             f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}"
         )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
-    if number and word == "fej":
+    if number and word in ("fej", "decoupled"):
         raise ValueError(f"modifier {word} takes no number, not {number}")
     return word, [int(number)] if number else []
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import published
 import pytest
 from pages import MARK, pages, read, rewritten
 
@@ -15,6 +16,13 @@ def test_the_numbers_of_a_page_are_those_of_the_results(page):
     new = rewritten(page.read_text(), RESULTS).splitlines()
     stale = [f"{a}\n  should be\n{b}" for a, b in zip(old, new, strict=True) if a != b]
     assert not stale, "\n".join(["`python benchmarks/pages.py` writes:", *stale])
+
+
+def test_the_table_of_published_values_is_that_of_its_results():
+    rows = RESULTS["published"]["rows"]
+    assert published.table_of(rows) in Path("docs/rivals.md").read_text()
+    for row in (row for row in rows if row["theirs"] is not None):
+        assert row["within"] == (row["interval95"][0] <= row["theirs"] <= row["interval95"][1])
 
 
 def test_pages_of_measurements_speak_of_results():

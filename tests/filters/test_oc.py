@@ -295,6 +295,8 @@ REMEDIES = [
     ("robocentric+oc2", PLANAR, "inverse_scaling"),
     ("world+oc", PLANAR, "framed_homogeneous"),
     ("world+fej", PLANAR, "inverse_scaling"),
+    ("world+fej2", PLANAR, "inverse_scaling"),
+    ("world+decoupled", PLANAR, "inverse_scaling"),
     ("invariant", PLANAR, "anchored_homogeneous"),
 ]
 
@@ -334,14 +336,14 @@ def test_where_the_heading_is_known_all_are_the_kalman_filter():
     frames = case.controls(), *case.frames(0)
     linear = case.compiled("world", "cartesian")(*frames)[1]
     assert np.trace(linear[1][-1]) > 1e-3
-    for name in ("world+oc", "world+fej", "invariant"):
+    for name in ("world+oc", "world+fej", "world+decoupled", "invariant"):
         same = case.compiled(name, "cartesian")(*frames)[1]
         for x, y in zip(jax.tree.leaves(linear), jax.tree.leaves(same), strict=True):
             np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize(
-    "name", quick_rows(1, ["world+fej", "robocentric+oc", "world+oc", "invariant"])
+    "name", quick_rows(1, ["world+fej2", "world+fej", "robocentric+oc", "world+oc", "invariant"])
 )
 def test_a_frame_without_measurements_changes_nothing(name):
     """Neither the mean nor the covariance, but for `ROUNDING`: remedies are of corrections."""

@@ -85,6 +85,9 @@ def test_filters_are_made_of_every_pair_of_names():
         ("world+fej", "parallax_angle", None, "written in one form, in themselves"),
         ("world_gauge+fej", "cartesian", None, "fej is for filters in metres, without a scale"),
         ("robocentric+fej", "cartesian", None, "fej is for world-centric filters: a robocentric"),
+        ("world+fej3", "cartesian", None, "modifier fej takes no number, not 3"),
+        ("world+decoupled2", "cartesian", None, "modifier decoupled takes no number, not 2"),
+        ("invariant+fej2", "cartesian", None, "one correction, not invariant and fej2"),
         ("keyframe+oc", "cartesian", None, "oc is not for keyframe filters, whose unobservable"),
         ("invariant+oc", "cartesian", None, "one correction, not invariant and oc"),
         ("world+mixture", "parallax_angle", None, "is split cannot switch the form of parallax"),
@@ -116,12 +119,19 @@ def test_what_the_motion_or_the_sensor_excludes_is_refused(scenario_fields, name
         make_filters(scenario("matched", scenario_fields), name, "cartesian")
 
 
-DELAYED = "delayed initialisation|switch the form of ray|fej needs landmarks that are written"
+DELAYED = "delayed initialisation|switch the form of ray|needs landmarks that are written"
+ONE = ("fej", "fej2", "decoupled", "oc")
 IN_WORLD = (
     ({"submaps"}, "submaps are of robocentric filters, not of world ones"),
-    ({"fej", "oc"}, "a filter has one correction, not fej and oc"),
-    ({"fej", "iterated"}, "fej takes one step of Gauss–Newton in an update"),
-    ({"fej", "mixture"}, "a mixture that is split does not go with fej"),
+    *(({*pair}, "a filter has one correction, not ") for pair in itertools.combinations(ONE, 2)),
+    *(
+        pair
+        for word in ("fej", "fej2", "decoupled")
+        for pair in (
+            ({word, "iterated"}, f"{word} takes one step of Gauss–Newton in an update"),
+            ({word, "mixture"}, f"a mixture that is split does not go with {word}"),
+        )
+    ),
     ({"directions", "mixture"}, "a filter has one sum of Gaussians, not directions and mixture"),
     *(
         ({word, late}, DELAYED)

@@ -27,7 +27,7 @@ from jaxslam.models.observations import Features, Slots
 
 Landmark = Callable[[PyTree, Array], Array]
 Noise = Float[Array, "p p"] | Float[Array, "m p p"]
-"""R of one measurement, or one of each of m."""
+"""R of one measurement, or one of each of m; in an update a joint one, m·p × m·p, too."""
 Prior = tuple[Float[Array, "*m q"], Float[Array, "*m q"]]
 """Mean and σ of what one measurement hides, for all landmarks or for each."""
 

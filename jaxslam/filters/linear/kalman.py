@@ -135,7 +135,7 @@ def kalman_update(
     x ⊞ offset, with H and the residuals of the state x; None is no offset."""
     predicted, residual, used, blocks = residuals(model, state, features, context)
     P = state.covariance
-    R = _noise_matrix(noise, used)
+    R = noise if noise.shape[-1] > residual.shape[1] else noise_matrix(noise, used)
     HP = observed(blocks, features.slots, P)
     S = observed(blocks, features.slots, HP.T).T + R
     factor = cholesky(S)
@@ -161,7 +161,7 @@ def kalman_update(
     return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
 
 
-def _noise_matrix(noise: Noise, used: Bool[Array, " m"]) -> Float[Array, "mp mp"]:
+def noise_matrix(noise: Noise, used: Bool[Array, " m"]) -> Float[Array, "mp mp"]:
     """Block-diagonal R, with an identity block where a feature is not used."""
     m, p = used.size, noise.shape[-1]
     blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))

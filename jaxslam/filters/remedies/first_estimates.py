@@ -15,17 +15,17 @@ from typing import ClassVar
 import jax
 from jaxtyping import Array, Float
 
+from jaxslam.filters.linear.blocks import Noise
 from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
 from jaxslam.filters.linear.state import State
-from jaxslam.filters.model import Context, SlamModel
+from jaxslam.filters.model import Context, Core, SlamModel
 from jaxslam.filters.remedies.observability_constrained import follow
 from jaxslam.models.observations import Features
 
 
-class FirstEstimates(AbstractCorrection):
+class AbstractFirstEstimates(AbstractCorrection):
     """Residuals of the estimate, H of the first estimates, and `transport` of the core."""
 
-    name: ClassVar[str] = "fej"
     divisible: ClassVar[bool] = False
     world_centric: ClassVar[bool] = True
     metric: ClassVar[bool] = True
@@ -33,16 +33,34 @@ class FirstEstimates(AbstractCorrection):
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         start, moved, predicted = _at_first(model, state, features, context)
+        noise = self.noise(model, state, moved, noise, context)
         after, innovation = kalman_update(model, start, None, moved, noise, context, considered)
         correction = after.landmarks - start.landmarks
-        after = follow(model, start, replace(after, landmarks=start.landmarks))
+        core = self.corrected(model, start, after)
+        after = follow(model, start, replace(after, core=core, landmarks=start.landmarks))
         after = replace(after, landmarks=state.landmarks + correction)
         return after, replace(innovation, predicted=predicted)
+
+    def noise(self, model: SlamModel, state: State, seen: Features, R: Noise, at: Context) -> Noise:
+        """R, with what the Jacobians of the first estimates leave out."""
+        del model, state, seen, at
+        return R
+
+    def corrected(self, model: SlamModel, before: State, after: State) -> Core:
+        """The core `before` the update with its correction, which `after` has added."""
+        del model, before
+        return after.core
 
     def remember(self, state, slots):
         first = state.landmarks if state.first is None else state.first
         new = state.landmarks[slots]
         return replace(state, first=first.at[slots].set(new, mode="drop"))
+
+
+class FirstEstimates(AbstractFirstEstimates):
+    """The published one."""
+
+    name: ClassVar[str] = "fej"
 
 
 def _at_first(

@@ -44,13 +44,13 @@ class Invariant(AbstractCorrection):
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         added, innovation = kalman_update(model, state, None, features, noise, context, considered)
-        N, L = _rigid_directions(model, state)
+        N, L = rigid_directions(model, state)
         after = _retracted(model, state, added, N, L)
-        N_after, _ = _rigid_directions(model, after)
+        N_after, _ = rigid_directions(model, after)
         return replace(after, covariance=carried(added.covariance, N_after - N, L)), innovation
 
 
-def _rigid_directions(
+def rigid_directions(
     model: SlamModel, state: State
 ) -> tuple[Float[Array, "n t"], Float[Array, "t n"]]:
     """N of the base frame, and how it is read from the pose."""
