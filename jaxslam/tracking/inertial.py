@@ -44,7 +44,8 @@ class Inertial:
         clock_offset: float | None = None,
     ) -> Inertial:
         """That of frames at these times, s, by the clock of the camera. It is at rest where the
-        readings of the first second are, and else has any velocity, σ 1 m/s.
+        readings of the first second are, and else has any velocity, σ 1 m/s: too little to track
+        with, but for `jaxslam.tracking.moving_start`.
 
         Raises ValueError, naming the frame, where no readings lead to one.
         """

@@ -16,6 +16,7 @@ from jaxslam.plots.tracking import plot_map
 from jaxslam.tracking.film import Aside, OverlayWriter
 from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.moving_start import begun
 from jaxslam.tracking.overlay import overlay_of, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
 from jaxslam.tracking.report import TEXTS, Tracked, add_latest
@@ -58,12 +59,15 @@ def track(
     of your own, in place of the one that the settings name. `target`, known points that the first
     frame sees, makes the map metric. `known` is the `map.npz` of another video by the same camera:
     this one goes on with that map where it is known again, by its settings. `inertial`, the
-    readings of an inertial unit, make all lengths metres. `viewer` is a file for the rerun viewer,
+    readings of an inertial unit, make all lengths metres; where it moves in the beginning, the
+    first 1.5 s are used for its start alone. `viewer` is a file for the rerun viewer,
     FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:
         settings = settings or TrackerSettings()
+        if inertial is not None:
+            source, inertial = begun(source, inertial, settings)
         tracker = Tracker(source.calibration, settings, slam, target, inertial)
     else:
         tracker = Tracker.localising(known, source.calibration, slam)
