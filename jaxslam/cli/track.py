@@ -113,6 +113,8 @@ class TrackOptions:
         if self.map is not None and self.target is not None:
             raise ValueError("give --map or --target, not both: a saved map already has a unit")
         target = None if self.target is None else read_target(self.target)
+        if self.imu_calibration and self.imu is None:
+            raise ValueError("--imu-calibration needs --imu, which says that readings are used")
         with one_line_warnings():
             inertial = None if self.imu is None else self._inertial(source)
         total = len(source) or self.frames

@@ -35,7 +35,8 @@ def at_rest(imu: Imu, seconds: Durations, gyroscope: Readings, accelerometer: Re
     Kalman update of the model's own biases, from which `b_a` and d are correlated. Raises
     ValueError, saying why, for readings that are not of rest.
     """
-    T, (rate, force) = seconds.sum(), _means(seconds, gyroscope, accelerometer)
+    T = seconds.sum()
+    rate, force = seconds @ gyroscope / T, seconds @ accelerometer / T
     for what, read, mean, density in (
         ("rates", gyroscope, rate, imu.density[0]),
         ("specific forces", accelerometer, force, imu.density[1]),
@@ -75,10 +76,6 @@ def moving(imu: Imu, seconds: Durations, gyroscope: Readings, accelerometer: Rea
 
     sigma = jnp.hypot(imu.density[1] / jnp.sqrt(T), speed / T)
     return _given(begun, force + imu.bias[3:], read, force, jnp.repeat(sigma, 3))
-
-
-def _means(seconds: Durations, *readings: Readings) -> list[Float[Array, " 3"]]:
-    return [seconds @ x / seconds.sum() for x in readings]
 
 
 def _force(imu: Imu, now: InertialState) -> Float[Array, " 3"]:
