@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -37,6 +38,17 @@ class TrackOptions:
     data set, if it has one."""
     target: Path | None = None
     """JSON file of known points visible in the first frame; the map is then in metres."""
+    imu: Annotated[
+        tuple[Path, ...] | None,
+        tyro.conf.arg(
+            metavar="[FILE]",
+            help="Readings of an inertial unit (docs/own-video.md); the map is then in metres. "
+            "Without a FILE those of the data set or bag.",
+        ),
+    ] = None
+    imu_calibration: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE]")] = ()
+    """Calibration of that unit: densities and its pose on the camera, as Kalibr's imu.yaml and
+    camchain-imucam.yaml. Default: that of the data set, if it has one."""
     map: Path | None = None
     """map.npz of an earlier video by the same camera: localise in that map, with the settings saved
     in it, and continue it."""
@@ -101,6 +113,10 @@ class TrackOptions:
         if self.map is not None and self.target is not None:
             raise ValueError("give --map or --target, not both: a saved map already has a unit")
         target = None if self.target is None else read_target(self.target)
+        if self.imu_calibration and self.imu is None:
+            raise ValueError("--imu-calibration needs --imu, which says that readings are used")
+        with one_line_warnings():
+            inertial = None if self.imu is None else self._inertial(source)
         total = len(source) or self.frames
         # What the bar says while the first frames wait for their programs.
         with warming_bar(total, "frame", "compiling …", WARM_UP, "tracking") as progress:
@@ -110,6 +126,7 @@ class TrackOptions:
                 self._settings(),
                 target=target,
                 known=self.map,
+                inertial=inertial,
                 overlay=self.overlay,
                 viewer=self.viewer,
                 progress=progress,
@@ -150,6 +167,32 @@ class TrackOptions:
         )
         part = selected(source, start=self.start, every=self.every)
         return part if self.scale is None else resized(part, self.scale)
+
+    def _inertial(self, source):
+        from jaxslam.io.imu import read_inertial
+        from jaxslam.io.imu_calibration import read_inertial_calibration
+        from jaxslam.tracking.inertial import Inertial
+
+        assert self.imu is not None
+        own, files = source.inertial, self.imu_calibration
+        if self.map is not None or self.target is not None:
+            raise ValueError("--imu starts a map of its own: give it without --map and --target")
+        if source.clock is not None or len(self.imu) > 1 or not (self.imu or own):
+            raise ValueError(
+                f"--imu takes one FILE of readings for a recording: {source.name} has none of its "
+                "own, or is a live camera"
+            )
+        readings = self.imu[0] if self.imu else own.readings
+        files = files or (() if own is None else own.calibration)
+        if not files:
+            raise ValueError(
+                f"the noise and the pose of the IMU of {readings} are not known: give "
+                "--imu-calibration imu.yaml camchain-imucam.yaml (docs/own-video.md)"
+            )
+        log, calibration = read_inertial(readings), read_inertial_calibration(*files)
+        for note in (*log.notes, *calibration.compared(log)):
+            warnings.warn(note, stacklevel=2)
+        return Inertial.of(log, calibration, source.times)
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None

@@ -216,7 +216,8 @@ class Imu(AbstractMotion):
         The biases are those of the middle of the step.
         """
         T = control.seconds
-        walked = noise[_WHITE:] * jnp.sqrt(jnp.where(T > 0, T, 1.0))
+        root = jnp.where(T > 0, jnp.sqrt(jnp.where(T > 0, T, 1.0)), 0.0)
+        walked = noise[_WHITE:] * root
         off = variables.bias + walked / 2 - control.bias
         error = control.by_bias @ off + control.by_noise @ noise[:_WHITE]
         pull = self.gravity * T * variables.down / jnp.linalg.norm(variables.down)

@@ -40,8 +40,12 @@ from jaxslam.filters.readouts import (
     log_unit,
 )
 from jaxslam.geometry import log, scaled
+from jaxslam.linalg import semidefinite_root
+from jaxslam.models.imu import Imu
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
+from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
@@ -60,8 +64,8 @@ Report = tuple[jax.Array, ...]
 class Predicted(NamedTuple):
     """A state of the filter before a frame's measurements, and what it expects of them."""
 
-    dt: Float[np.ndarray, ""]
-    """Since the frame before, s."""
+    control: Control
+    """Of the motion since the frame before: its seconds, or what an inertial unit tells."""
     state: Belief
     gaussian: Belief
     """The same as one Gaussian."""
@@ -111,31 +115,40 @@ class Estimator:
 
     slam: AbstractStaged
     settings: TrackerSettings
+    inertial: Inertial | None = None
+    """What tells the motion, if anything does."""
 
     @classmethod
-    def of(cls, slam: AbstractStaged, settings: TrackerSettings) -> Estimator:
+    def of(
+        cls, slam: AbstractStaged, settings: TrackerSettings, inertial: Inertial | None = None
+    ) -> Estimator:
         """With the filter's numbers in 64 bits."""
-        return cls(cast(slam, jnp.float64), settings)
+        return cls(cast(slam, jnp.float64), settings, inertial)
 
-    def empty(self) -> Belief:
-        """The state of a map without landmarks."""
-        return _empty(self.slam, self.settings.capacity)
+    def empty(self, before: Belief | None = None) -> Belief:
+        """The state of a map without landmarks, whose inertial unit goes on as `before`."""
+        return _empty(self.slam, self.settings.capacity, before)
 
-    def predict(
-        self, state: Belief, seconds: float | np.ndarray, livelier: float = 1.0
-    ) -> Predicted:
-        """Return what the filter expects so many seconds after the frame before, of a camera whose
-        accelerations have so many times their σ."""
+    def control(self, time: float, seconds: float) -> Control:
+        """The control of the motion in so many seconds before a time."""
         # A number of Python's would be compiled into the program.
-        dt, slam = np.asarray(seconds), self.slam
+        if self.inertial is None:
+            return np.asarray(seconds)
+        return self.inertial.control(time - seconds, time)
+
+    def predict(self, state: Belief, control: Control, livelier: float = 1.0) -> Predicted:
+        """Return what the filter expects after the motion of this control, as seconds, of a camera
+        whose accelerations have so many times their σ."""
+        control = np.asarray(control) if isinstance(control, float) else control
+        slam = self.slam
         if livelier != 1.0 and isinstance(slam, AbstractSlam):
             sigma = livelier * slam.motion.noise_sigma
             slam = replace(slam, motion=replace(slam.motion, noise_sigma=sigma))
-        (state, gaussian), joint, view = _predict(slam, state, dt)
+        (state, gaussian), joint, view = _predict(slam, state, control)
         joint, view = jax.device_get((joint, view))
         view = Prediction(*view)
         _check_finite(view.T_wc)
-        return Predicted(dt, state, gaussian, joint, view)
+        return Predicted(control, state, gaussian, joint, view)
 
     def believes(
         self,
@@ -163,7 +176,7 @@ class Estimator:
         first, second = np.nonzero(same & ~np.eye(len(slots), dtype=bool))
         S[first, :, second] -= R
         if curved:
-            S[i, :, i] += np.asarray(_curved(self.slam, *predicted[1:3], predicted.dt))[slots]
+            S[i, :, i] += np.asarray(_curved(self.slam, *predicted[1:3], predicted.control))[slots]
         more = self.settings.noise_factors(matches.variances) - 1 + self.settings.tolerance**2
         S[i, :, i] += more[:, None, None] * R
         view = predicted.view
@@ -214,7 +227,7 @@ class Estimator:
         slots, wanted = seen.slots, self.settings.wanted
         factors = self.settings.noise_factors(seen.variances)
         features = _measured(_padded(slots, seen.believed, wanted), factors)
-        state, correction = _correct(self.slam, predicted.state, predicted.dt, features)
+        state, correction = _correct(self.slam, predicted.state, predicted.control, features)
         correction = Correction(*jax.device_get(correction))
         return state, correction._replace(used=correction.used[: len(slots)])
 
@@ -271,13 +284,15 @@ class Estimator:
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
         """Start two threads that compile all programs in the order in which they are needed."""
-        slam, state, dt = self.slam, self.empty(), np.zeros(())
+        slam, state, still = self.slam, self.empty(), np.zeros(())
+        if self.inertial is not None:
+            still = self.inertial.imu.still(jnp.float64)
         new = _padded(*_NOWHERE, self.settings.wanted)
-        gone = np.zeros(self.settings.capacity, bool)
+        none, gone = _measured(new, np.zeros(0)), np.zeros(self.settings.capacity, bool)
 
         def predicted() -> Predicted:
-            (ahead, gaussian), joint, view = _predict.compile(slam, state, dt)
-            return Predicted(dt, ahead, gaussian, joint, Prediction(*view))
+            (ahead, gaussian), joint, view = _predict.compile(slam, state, still)
+            return Predicted(still, ahead, gaussian, joint, Prediction(*view))
 
         def believed(association: Association | None) -> None:
             nothing = np.zeros((0, 2)), np.zeros((0, 2, 0, 2)), np.zeros(0, bool), np.zeros(0, int)
@@ -285,8 +300,12 @@ class Estimator:
             one = association or ASSOCIATIONS[self.settings.association]
             _believed.compile(one, *self._of_fixed_size(*nothing, several))
             if several:
-                _curved.compile(slam, *predicted()[1:3], dt)
+                _curved.compile(slam, *predicted()[1:3], still)
 
+        back = (
+            lambda: _moving.compile(slam, state, np.eye(4), np.zeros(6), still),
+            lambda: _at_rest.compile(slam, state),
+        )
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
         return [
             in_background(
@@ -294,12 +313,11 @@ class Estimator:
             ),
             in_background(
                 lambda: _begin_map.compile(slam, state, new, None),
-                lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
+                lambda: _correct.compile(slam, predicted().state, still, none),
                 *(partial(believed, one) for one in (*wide, None)),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),
                 lambda: _remove.compile(slam, state, gone),
-                lambda: _moving.compile(slam, state, np.eye(4), np.zeros(6), dt),
-                lambda: _at_rest.compile(slam, state),
+                *(back if self.inertial is None else ()),
             ),
         ]
 
@@ -374,8 +392,24 @@ def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
 
 
 @Program
-def _empty(slam: AbstractStaged, capacity: int) -> Belief:
-    return slam.init(capacity)
+def _empty(slam: AbstractStaged, capacity: int, before: Belief | None) -> Belief:
+    return _going_on(slam, before).init(capacity)
+
+
+def _going_on(slam: AbstractStaged, state: Belief | None) -> AbstractStaged:
+    """The filter whose inertial unit, if it has one, starts as it is in this state; what is not
+    finite of its covariance is as little known as at a start in motion."""
+    if state is None or not (isinstance(slam, AbstractSlam) and isinstance(slam.motion, Imu)):
+        return slam
+    _, now = slam.gaussian(state, None)
+    part = now.core.part("motion")
+    size = part.stop - part.start
+    # The length of gravity's direction has no variance, but for rounding.
+    root = semidefinite_root(now.covariance[part, part] + 1e-12 * jnp.eye(size)).root
+    started = slam.motion.begun(now.core.motion, root)
+    wide = replace(started, root=None).start()[1]
+    root = jnp.where(jnp.isfinite(root).all(), root, wide)
+    return replace(slam, motion=replace(started, root=root))
 
 
 @Program
@@ -410,16 +444,16 @@ def _with_velocity(state: Belief, velocity: jax.Array, covariance: jax.Array) ->
 
 @Program
 def _predict(
-    slam: AbstractStaged, state: Belief, dt: jax.Array
+    slam: AbstractStaged, state: Belief, control: Control
 ) -> tuple[tuple[Belief, Belief], jax.Array, tuple[PyTree, ...]]:
     """The predicted state, as it is and as one Gaussian, and of that the covariance of all
     innovations and the `Prediction`."""
-    state = slam.predict(state, dt)
-    one, gaussian = slam.gaussian(state, dt)
+    state = slam.predict(state, control)
+    one, gaussian = slam.gaussian(state, control)
     slots = jnp.arange(slam.in_map(state).size)
-    seen = one.predict_features(gaussian, dt, slots)
+    seen = one.predict_features(gaussian, control, slots)
     usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
-    joint = candidates(one, gaussian, dt, Features(slots, seen.measured, usable)).covariance
+    joint = candidates(one, gaussian, control, Features(slots, seen.measured, usable)).covariance
     metres = jnp.exp(log_unit(one, gaussian))
     pose, omegas = scaled(seen.pose, 1 / metres).as_matrix(), metres * seen.omegas
     sides = landmarks_on_sides(one, gaussian, slots)
@@ -439,20 +473,20 @@ def _believed(
 
 
 @Program
-def _curved(slam: AbstractStaged, state: Belief, gaussian: Belief, dt: jax.Array) -> jax.Array:
+def _curved(slam: AbstractStaged, state: Belief, gaussian: Belief, control: Control) -> jax.Array:
     """The terms of second order of every slot's measurement, (n, 2, 2)."""
-    one, _ = slam.gaussian(state, dt)
+    one, _ = slam.gaussian(state, control)
     if not isinstance(one, AbstractSlam):
         return jnp.zeros(())
-    return second_order(one, gaussian, dt, jnp.arange(slam.in_map(state).size))
+    return second_order(one, gaussian, control, jnp.arange(slam.in_map(state).size))
 
 
 @Program
 def _correct(
-    slam: AbstractStaged, state: Belief, dt: jax.Array, features: Features
+    slam: AbstractStaged, state: Belief, control: Control, features: Features
 ) -> tuple[Belief, tuple[jax.Array, ...]]:
-    state, innovation = slam.update(state, dt, features)
-    state = slam.compose(state, dt)
+    state, innovation = slam.update(state, control, features)
+    state = slam.compose(state, control)
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
@@ -460,7 +494,7 @@ def _correct(
 def _begin_map(
     slam: AbstractStaged, state: Belief, new: Features, depths: tuple[jax.Array, jax.Array] | None
 ) -> tuple[Belief, Report]:
-    capacity = slam.in_map(state).size
+    capacity, slam = slam.in_map(state).size, _going_on(slam, state)
     if depths is None:
         state = slam.init(capacity, new)
     else:

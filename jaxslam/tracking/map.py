@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.io.calibration import Calibration
+from jaxslam.models.motion import Control
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations, Slots
@@ -278,16 +279,16 @@ class TrackerState:
         """The state without a measurement; `anew` where that is broken too."""
         state, correction = self.estimator.correct(predicted)
         if correction.failed:
-            return self.anew(predicted.dt)
+            return self.anew(predicted.control)
         return self.with_map(state=state)
 
-    def anew(self, seconds: Float[np.ndarray, ""]) -> TrackerState:
-        """The state with an empty filter: the camera is as far from where it was so many seconds
-        ago as the prior on a start's velocity lets it be."""
+    def anew(self, control: Control) -> TrackerState:
+        """The state with an empty filter: the camera is as far from where it was before the motion
+        of this control as the prior on a start's velocity lets it be."""
         place = self.map.place.restarted()
         place = replace(place, log_unit=-place.log_scale)  # an empty state is in metres
         now = self._begun_anew(place, number=self.map.number)
-        state, correction = self.estimator.correct(self.estimator.predict(now.map.state, seconds))
+        state, correction = self.estimator.correct(self.estimator.predict(now.map.state, control))
         return now if correction.failed else now.with_map(state=state)
 
     def given_up(self, slots: list[int], recorded: Points | None = None) -> TrackerState:
@@ -306,9 +307,10 @@ class TrackerState:
         return replace(self.given_up(sorted(self.landmarks)), left=left, seen=None)
 
     def _begun_anew(self, place: MapInWorld, number: int) -> TrackerState:
-        """A map of this number with the landmarks that there are, and nothing else."""
+        """A map of this number with the landmarks that there are, and of the rest what an inertial
+        unit knows."""
         submap = self.latest_submap + 1
-        map = Map(self.estimator.empty(), place, self.landmarks, number, submap)
+        map = Map(self.estimator.empty(self.map.state), place, self.landmarks, number, submap)
         return replace(self, map=map, latest_submap=submap)
 
     def _with_room(self, count: int, kept: Int[np.ndarray, " n"]) -> TrackerState:

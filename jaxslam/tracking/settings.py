@@ -15,7 +15,7 @@ from jaxslam.io.calibration import LENS_SIGMA, Calibration
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.motion import AbstractMotion, ConstantVelocity
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.optics import camera_of
 
@@ -27,6 +27,8 @@ UNSTATED = 0.003
 to 3 ‰, of what a data set publishes up to 12 ‰ (docs/sequences.md)."""
 METRIC = "world"
 """The filter where a target says how long a metre is."""
+INERTIAL = "robocentric+drift20"
+"""The filter where an inertial unit does: `recommended` for its motion, and landmarks drift."""
 
 
 @dataclass(frozen=True)
@@ -122,13 +124,16 @@ class TrackerSettings:
         `noise_factors`."""
         return np.maximum(variances, self.pixel_sigma**2 / FIT) * factors
 
-    def make_filter(self, calibration: Calibration) -> AbstractFilter:
-        """The filter that is named, with these numbers. Raises ValueError."""
+    def make_filter(
+        self, calibration: Calibration, motion: AbstractMotion | None = None
+    ) -> AbstractFilter:
+        """The filter that is named, with these numbers, or with a motion of another kind. Raises
+        ValueError."""
         accelerations = [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3
         velocities = [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3
         return make_filter(
             self.filter,
-            motion=ConstantVelocity(accelerations, [0.0] * 6, velocities),
+            motion=motion or ConstantVelocity(accelerations, [0.0] * 6, velocities),
             sensor=Pinhole(camera_of(calibration), self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),

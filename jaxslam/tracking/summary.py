@@ -68,6 +68,7 @@ def summarised(
         "lost_reasons": dict(Counter(result.reason for result in history if result.reason)),
         "restarts": tracker.restarts,
         "repeated": sum(result.repeated for result in history),
+        "unit": "map" if tracker.inertial is None else "m",
         "maps": max(1, len({result.map for result in history if not result.lost})),
         "relocalised": sum(result.relocalised for result in history),
         "submaps": len({result.submap for result in history}),
@@ -97,7 +98,15 @@ def summarised(
     }
     if tracker.target is not None and tracker.sighting is not None:
         summary["target"] = as_summary(tracker.target, tracker.sighting)
-    if tracker.restarts:
+    if (inertial := tracker.inertial) is not None:
+        summary["inertial"] = {
+            "readings": inertial.log.name,
+            "start": inertial.why_moving or "at rest",
+        }
+        with suppress(ValueError):
+            trajectories = *trajectory_of(history), *(source.reference or ([], []))
+            summary["ate_metres"] = absolute_trajectory_error(*trajectories, scaled=False)
+    elif tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
     return summary | trajectory_errors(source, history)
 
@@ -138,9 +147,8 @@ def describe(summary: Summary) -> str:
             f"{one['sigma']:.1%}"
         )
     if summary["maps"] > 1:
-        lines.append(
-            f"{summary['maps']} maps, each with its own unit; frames.csv shows where each begins"
-        )
+        own = ", each with its own unit" if summary["unit"] == "map" else ""
+        lines.append(f"{summary['maps']} maps{own}; frames.csv shows where each begins")
     lines += [_unit_line(unit) for unit in summary["units"] if unit["sigma_log_scale"] is not None]
     camera = summary["calibration"]
     if lens := summary["lens"]:
@@ -152,8 +160,9 @@ def describe(summary: Summary) -> str:
         lines += ["camera: " + ", ".join(told), *([camera["caveat"]] if "caveat" in camera else [])]
     if "better_lens" in camera:
         lines.append(_better(camera["better_lens"], camera["given"]))
-    if "ate" in summary:
-        ate = summary["ate"]
+    if unit := summary.get("inertial"):
+        lines.append(f"positions are in metres, by {unit['readings']}; start: {unit['start']}")
+    for ate in (summary[key] for key in ("ate_metres", "ate") if key in summary):
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
         lines.append(
             f"absolute trajectory error after {ate['alignment']} alignment: {ate['rmse']:.4f} on "

@@ -24,6 +24,7 @@ from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
 from jaxslam.tracking.estimator import Correction, Estimator
+from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
@@ -35,7 +36,7 @@ from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import JERK, LEAST_MATCHES, Policy
 from jaxslam.tracking.pose_with_covariance import Pixels, Places, Transform
 from jaxslam.tracking.report import Tracked
-from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.settings import INERTIAL, TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
 
@@ -50,11 +51,15 @@ Stepped = tuple[TrackerState, Tracked]
 
 
 def start(
-    slam: AbstractStaged, settings: TrackerSettings, calibration: Calibration
+    slam: AbstractStaged,
+    settings: TrackerSettings,
+    calibration: Calibration,
+    inertial: Inertial | None = None,
 ) -> TrackerState:
-    """The state before the first frame of a camera with this calibration."""
+    """The state before the first frame of a camera with this calibration, and maybe a unit whose
+    readings tell its motion to a filter that has its model."""
     with jax.enable_x64(True):
-        estimator = Estimator.of(slam, settings)
+        estimator = Estimator.of(slam, settings, inertial)
         return TrackerState(estimator, calibration, Map(estimator.empty()))
 
 
@@ -81,6 +86,9 @@ def step(
         )
     waited = 0.0 if state.time is None else frame.time - state.time + state.waiting
     apart, known = _apart(state.image, frame.image), state.landmarks and not state.unmeasured
+    if (inertial := state.estimator.inertial) is not None:
+        # A picture that stays the same is then of a camera that stands still.
+        known = known and state.repeats < MOST_REPEATS
     if known and apart <= max(SAME, min(NEARLY * state.apart, MOST_APART)):
         # The camera is where this picture was taken. What comes after few such pictures has their
         # time too; after many the camera, or the picture, stood still.
@@ -89,7 +97,7 @@ def step(
         tracked = Tracked.of(frame, state.map, repeated=True)
     else:
         with jax.enable_x64(True):
-            state = replace(state, estimator=Estimator.of(slam, settings))
+            state = replace(state, estimator=Estimator.of(slam, settings, inertial))
             try:
                 after, tracked = _taken(state, frame, waited, sighting)
             except (FloatingPointError, LinAlgError):
@@ -127,7 +135,9 @@ def _broken(state: TrackerState, frame: Frame, seconds: float) -> Stepped:
     state = _with_failure(state, "not_finite").remembered()
     state = replace(state, unmeasured=state.unmeasured + 1)
     try:
-        begun = state.given_up(sorted(state.landmarks)).anew(np.asarray(seconds))
+        begun = state.given_up(sorted(state.landmarks)).anew(
+            state.estimator.control(frame.time, seconds)
+        )
         return _lost(begun, frame, Lost.NOT_FINITE)
     except (FloatingPointError, LinAlgError):
         return state, Tracked.of(frame, state.map, reason=Lost.NOT_FINITE)
@@ -152,15 +162,16 @@ def _searching(state: TrackerState, frame: Frame, policy: Policy) -> Stepped:
 def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> Stepped:
     """Track a frame so many seconds after the one before."""
     estimator, lost = state.estimator, state.unmeasured > 0
-    predicted = estimator.predict(state.map.state, seconds)
+    predicted = estimator.predict(state.map.state, estimator.control(frame.time, seconds))
     ahead, behind = predicted.view.sides
     if behind > ahead and behind >= LEAST_MATCHES:
         # Nobody is to come back to it.
         state = replace(state, reversed=state.reversed + 1, seen=None)
         return _lost(state.coasted(predicted), frame, Lost.REVERSED)
     seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
-    if not lost and state.map.place.unit_fixed:
-        jerked = estimator.predict(state.map.state, predicted.dt, JERK)
+    # What an inertial unit feels is no jerk.
+    if not lost and estimator.inertial is None and state.map.place.unit_fixed:
+        jerked = estimator.predict(state.map.state, predicted.control, JERK)
         if reason is not None or estimator.likelier(jerked, predicted, seen):
             found, why, wavers = policy.observed(frame.image, state, jerked, lost=lost)
             if why is None:
@@ -265,6 +276,9 @@ class Tracker:
     target: Target | None = None
     """Points of known positions, m, that the first frame sees: then the first map is in metres, the
     unit of `nearest_depth`. For a `Slam` of one Gaussian, in metres, of no common depth."""
+    inertial: Inertial | None = None
+    """The readings of an inertial unit beside the camera: then lengths are metres, and the filter
+    of the default settings is `INERTIAL`."""
     sighting: TargetObservation | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
@@ -278,11 +292,16 @@ class Tracker:
                 f"calibration must be a Calibration, not a {type(self.calibration).__name__}; "
                 "jaxslam.io.read_calibration reads one from a file"
             )
-        settings, own = self.settings, self.filter
+        own, motion = self.filter, None
+        if self.inertial is not None:
+            motion = self.inertial.imu
+            if self.settings.filter == TrackerSettings.filter:
+                self.settings = replace(self.settings, filter=INERTIAL)
+        settings = self.settings
         self.filter_name = settings.filter if own is None else type(own).__name__
-        made = settings.make_filter(self.calibration) if own is None else own
+        made = settings.make_filter(self.calibration, motion) if own is None else own
         made = trackable(self.filter_name, made, settings, self.target)
-        self.state = start(made, settings, self.calibration)
+        self.state = start(made, settings, self.calibration, self.inertial)
 
     def __getattr__(self, name: str):
         """What the state says."""
@@ -340,16 +359,26 @@ class Tracker:
         if self.state.time is None:
             raise ValueError("a tracker without any frame has nothing to save")
         own = None if self.filter is None else self.filter_name
+        if self.inertial is not None:
+            own = f"{self.filter_name} and an inertial unit"
         persistence.save(path, self.state, self.settings, own)
 
     @classmethod
-    def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
+    def load(
+        cls,
+        path: str | Path,
+        filter: AbstractStaged | None = None,
+        inertial: Inertial | None = None,
+    ) -> Tracker:
         """The tracker that was saved, which goes on as that would have: digit by digit.
 
-        If it had a `filter` of your own, pass that again. Raises ValueError for a file
-        that is none, or of another filter.
+        If it had a `filter` of your own or an inertial unit, pass that again. Raises ValueError for
+        a file that is none, or of another filter.
         """
-        return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
+        own = filter is not None or inertial is not None
+        return persistence.load(
+            path, partial(cls, filter=filter, inertial=inertial), own_filter=own
+        )
 
     @classmethod
     def localising(

@@ -66,12 +66,18 @@ def write_covariances(
 
 
 def absolute_trajectory_error(
-    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+    *,
+    scaled: bool = True,
 ) -> TrajectoryError:
-    """The absolute trajectory error of the positions after a Sim(3) alignment.
+    """The absolute trajectory error of the positions after a Sim(3) alignment, or one by SE(3) of
+    an estimate in metres that is not `scaled`.
 
     Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). Poses are paired by their
-    times (`associated`), and the estimate is aligned with scale (Umeyama's method).
+    times (`associated`), and the estimate is aligned by Umeyama's method.
     `path_length` is the reference's over the paired poses, `extent` the diagonal of the box
     around them, `matched` their number.
 
@@ -85,10 +91,10 @@ def absolute_trajectory_error(
     coincide.
     """
     pairs = _paired(estimate_times, estimate, reference_times, reference)
-    positions, aligned = pairs.reference[:, :3, 3], pairs.aligned()
+    positions, aligned = pairs.reference[:, :3, 3], pairs.aligned(scaled=scaled)
     turn, angle = _by_orientation(pairs.estimate, pairs.reference)
     return {
-        "alignment": "sim3",
+        "alignment": "sim3" if scaled else "se3",
         "rmse": _rms(aligned[:, :3, 3] - positions),
         "path_length": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         "extent": float(np.linalg.norm(np.ptp(positions, axis=0))),
@@ -149,13 +155,13 @@ class _Pairs(NamedTuple):
     estimate: Float[np.ndarray, "k 4 4"]
     reference: Float[np.ndarray, "k 4 4"]
 
-    def alignment(self) -> Similarity:
-        """The Sim(3) that takes the estimate to where it fits best."""
-        return similarity(*(T[:, :3, 3] for T in (self.estimate, self.reference)), scaled=True)
+    def alignment(self, *, scaled: bool = True) -> Similarity:
+        """The Sim(3), or SE(3), that takes the estimate to where it fits best."""
+        return similarity(*(T[:, :3, 3] for T in (self.estimate, self.reference)), scaled=scaled)
 
-    def aligned(self) -> Float[np.ndarray, "k 4 4"]:
+    def aligned(self, *, scaled: bool = True) -> Float[np.ndarray, "k 4 4"]:
         """The estimate in the reference's world."""
-        return self.alignment().moved(self.estimate)
+        return self.alignment(scaled=scaled).moved(self.estimate)
 
 
 def _paired(*trajectories: ArrayLike) -> _Pairs:

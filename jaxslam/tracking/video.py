@@ -14,7 +14,9 @@ from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.source import Frame, Source
 from jaxslam.plots.tracking import plot_map
 from jaxslam.tracking.film import Aside, OverlayWriter
+from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.moving_start import begun
 from jaxslam.tracking.overlay import overlay_of, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
 from jaxslam.tracking.report import TEXTS, Tracked, add_latest
@@ -41,6 +43,7 @@ def track(
     slam: AbstractStaged | None = None,
     target: Target | None = None,
     known: str | Path | None = None,
+    inertial: Inertial | None = None,
     overlay: bool = True,
     viewer: str | Path | None = None,
     progress: Callable[[int], None] = lambda frames: None,
@@ -55,12 +58,17 @@ def track(
     raised again; an interruption of the first frame or the second leaves none. `slam` is a filter
     of your own, in place of the one that the settings name. `target`, known points that the first
     frame sees, makes the map metric. `known` is the `map.npz` of another video by the same camera:
-    this one goes on with that map where it is known again, by its settings. `viewer` is a file for
-    the rerun viewer, FILE.rrd, written beside the others.
+    this one goes on with that map where it is known again, by its settings. `inertial`, the
+    readings of an inertial unit, make all lengths metres; where it moves in the beginning, the
+    first 1.5 s are used for its start alone. `viewer` is a file for the rerun viewer,
+    FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:
-        tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
+        settings = settings or TrackerSettings()
+        if inertial is not None:
+            source, inertial = begun(source, inertial, settings)
+        tracker = Tracker(source.calibration, settings, slam, target, inertial)
     else:
         tracker = Tracker.localising(known, source.calibration, slam)
     if source.clock is not None:
@@ -155,7 +163,8 @@ def _write(
             summary["ate_causal"] = error
     write_json(out / "summary.json", summary, allow_nan=False)
     known = known_points(points, history)
-    _draw_map(known, history, before, reference_in_map(source, history), out)
+    unit = "m" if summary["unit"] == "m" else "map units"
+    _draw_map(known, history, before, reference_in_map(source, history), unit, out)
     return summary
 
 
@@ -164,6 +173,7 @@ def _draw_map(
     history: list[Tracked],
     before: list[Tracked],
     reference: np.ndarray | None,
+    unit: str,
     out: Path,
 ) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
@@ -176,7 +186,7 @@ def _draw_map(
         known.in_map,
         reference=reference,
         path=out / "map.png",
-        unit="map units",
+        unit=unit,
         lost=[result.lost for result in history],
         begun=begun,
         begun_covariances=[history[place].camera.position_covariance for place in begun],

@@ -52,7 +52,7 @@ def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(es
         tolerance = SMALL.tolerance * SMALL.pixel_sigma
         direct = quick_jit(
             lambda state, dt: candidates(estimator.slam, state, dt, features, tolerance)
-        )(predicted.gaussian, predicted.dt)
+        )(predicted.gaussian, predicted.control)
     np.testing.assert_allclose(residual, direct.residual, atol=1e-9)
     np.testing.assert_allclose(S, direct.covariance, rtol=1e-9, atol=1e-9)
     assert valid.all()
@@ -84,7 +84,7 @@ def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(esti
             state, _ = estimator.slam.update(state, dt, features)
             return estimator.slam.predict_features(state, dt, jnp.arange(SMALL.capacity))
 
-        after = expected_after(predicted.gaussian, predicted.dt)
+        after = expected_after(predicted.gaussian, predicted.control)
     others = np.setdiff1d(np.flatnonzero(predicted.view.usable), slots)
     moved = given.pixels - predicted.view.pixels
     assert np.abs(moved[others]).max() > 1e-3
@@ -122,7 +122,7 @@ def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimated):
         predicted = estimator.predict(state_before, 1 / 30)
         pixels = jnp.array(predicted.view.pixels[slots] + aside)
         features = Features(jnp.array(slots), pixels, jnp.ones(3, bool), jnp.full(3, 4.0))
-        at = predicted.gaussian, predicted.dt
+        at = predicted.gaussian, predicted.control
         state, _ = quick_jit(lambda *at: estimator.slam.update(*at, features))(*at)
         sensor = replace(estimator.slam.sensor, sigma=2 * SMALL.pixel_sigma)
         worse = replace(estimator.slam, sensor=sensor)
