@@ -73,13 +73,15 @@ class Inertial(Benchmark):
         found: dict[str, Any] = {}
         for index, part in enumerate(PARTS):
             third = self.steps // 3
-            spans = {"first": np.s_[:third], "second": np.s_[third : 2 * third]}
-            spans |= {"last": np.s_[2 * third :], "end": np.s_[-10:]}
+            spans = {
+                "first": slice(third), "second": slice(third, 2 * third),
+                "last": slice(2 * third, None), "end": slice(-10, None),
+            }  # fmt: skip
             means = {of: nees[:, span, index].mean(axis=1) / 3 for of, span in spans.items()}
             found[part] = {of: [float(x.mean()), *_interval95(x)] for of, x in means.items()}
             found[part]["rmse"] = float(np.sqrt(np.mean(errors[:, -1, index])))
-        lost = (nees > chi2_quantile(0.9999, 3)).any(axis=2)
-        return found | {"lost": float(lost[:, -1].mean())}
+        lost = np.any(nees[:, -1] > chi2_quantile(0.9999, 3), axis=1)
+        return found | {"lost": float(np.mean(lost))}
 
     def report(self, results: dict[str, Any]) -> None:
         for trajectory, filters in results.items():
@@ -121,8 +123,9 @@ def _of_runs(slam, world, options: Inertial) -> tuple[np.ndarray, np.ndarray]:
         jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))
         for i in range(0, options.runs, options.chunk)
     ]
-    told = [np.moveaxis(np.array(part), (0, 1), (-2, -1)) for part in parts]
-    return tuple(np.moveaxis(np.concatenate(told), -1, 0))
+    runs_first = [np.moveaxis(np.array(part), (0, 1), (-2, -1)) for part in parts]
+    whole = np.concatenate(runs_first, axis=0)
+    return whole[..., 0], whole[..., 1]
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
-from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, identity, joined, log, retract
+from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, joined, log, retract
 from jaxslam.models.motion import AbstractMotion
 
 Vector = Float[Array, " 3"]
@@ -125,8 +125,9 @@ def _integrated(
         return ((middle @ half).normalize(), sped + gain, moved + (sped + gain / 2) * h), None
 
     none = jnp.zeros(3, rates.dtype)
-    start = identity(SPATIAL, rates.dtype).rotation(), none, none
-    return jax.lax.scan(one, start, (seconds, rates, forces))[0]
+    start = jaxlie.SO3(jnp.array([1.0, 0.0, 0.0, 0.0], rates.dtype)), none, none
+    (turned, sped, moved), _ = jax.lax.scan(one, start, (seconds, rates, forces))
+    return turned, sped, moved
 
 
 def _slope(seconds: Float[Array, " m"], total: Scalar) -> Float[Array, " m"]:
@@ -259,14 +260,14 @@ class Imu(AbstractMotion):
         def zeros(*shape):
             return jnp.zeros(shape, dtype)
 
-        turned = identity(SPATIAL, dtype).rotation()
+        turned = jaxlie.SO3(jnp.array([1.0, 0.0, 0.0, 0.0], dtype))
         return Increments(zeros(), turned, zeros(3), zeros(3), zeros(6), zeros(9, 6), zeros(9, 12))
 
     def along(
-        self, path: Pose, seconds: Scalar, down: Vector, key: Array
+        self, path: Pose, seconds: Scalar, down: Vector | None, key: Array
     ) -> tuple[Pose, Increments, Imu]:
         """Readings of a camera along a path of `steps · readings + 1` poses, `seconds` apart, in a
-        world where gravity points `down`.
+        world where gravity points `down`, or where it is the model's mean at the first pose.
 
         Velocities are central differences. The poses that are returned, of every frame, are where
         the readings without errors lead from the first, and the model has a start that is off by
@@ -277,9 +278,11 @@ class Imu(AbstractMotion):
         off = sigma * jax.random.normal(mount_key, sigma.shape, sigma.dtype)
         unit = jax.vmap(lambda T_WC: T_WC @ self.mount(off))(path)
         R, p = unit.rotation(), unit.translation()
-        v = jnp.gradient(p, axis=0) / seconds
+        v = jnp.asarray(jnp.gradient(p, axis=0)) / seconds
         turns = jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(*_neighbours(R)))
         half = jax.vmap(lambda a, turn: a @ exp(jaxlie.SO3, turn / 2))(_neighbours(R)[0], turns)
+        if down is None:
+            down = jax.tree.map(lambda x: x[0], R) @ jnp.asarray(self.down)
         pull = self.gravity * down
         forces = jax.vmap(lambda R, a: R.inverse() @ (a - pull))(
             half, jnp.diff(v, axis=0) / seconds

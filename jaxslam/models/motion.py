@@ -53,6 +53,10 @@ class AbstractMotion(eqx.Module):
         def noise_sigma(self) -> Float[AnyArray, " q"]:
             """σ of the white noise of one step (Q of P11)."""
 
+        @property
+        def readings(self) -> int:
+            """Poses of a step along which a simulation reads it; of one that has `along`."""
+
     def start(self) -> tuple[Variables, Float[Array, "v v"]]:
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
         return (), jnp.zeros((0, 0))
@@ -87,11 +91,11 @@ class AbstractMotion(eqx.Module):
         return control
 
     def along(
-        self, path: Pose, seconds: Scalar, down: Float[Array, " n"], key: Array
+        self, path: Pose, seconds: Scalar, down: Float[Array, " n"] | None, key: Array
     ) -> tuple[Pose, Control, AbstractMotion]:
         """What a simulation draws along a path of T_WC that are `seconds` apart: the true poses of
         frames, the control of every step, and the model with this run's start. Only of a model
-        that says so; `down` is the direction of gravity in W."""
+        that says so; `down` is the direction of gravity in W, the model's own where it is None."""
         raise NotImplementedError(f"{type(self).__name__} does not say how it is read along a path")
 
     def enlarged(

@@ -152,14 +152,11 @@ def _read_path(world: World, key: Array) -> tuple[Pose, Control, AbstractMotion]
     of a motion that is read many times a step."""
     motion = world.motion
     path_key, key = jax.random.split(key)
-    seconds = 1 / (world.rate * motion.readings)
+    seconds = jnp.asarray(1 / (world.rate * motion.readings))
     if isinstance(world.trajectory, RecordedMotion):
         path, down = world.trajectory.piece(path_key), -jnp.eye(3, dtype=seconds.dtype)[2]
     else:
-        path, down = (
-            _swaying(world, path_key, seconds),
-            motion.mount(jnp.zeros(0)).rotation() @ motion.down,
-        )
+        path, down = _swaying(world, path_key, seconds), None
     poses, controls, told = motion.along(path, seconds, down, key)
     return from_first(poses), controls, told
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import inertial
 import numpy as np
 import pytest
-from recordings import DATA
 
 STORED = Path(__file__).resolve().parents[2] / "benchmarks/results/inertial.json"
 
@@ -26,9 +25,9 @@ def test_the_stored_runs_are_consistent_to_the_end_where_the_page_says_so():
 
 
 @pytest.mark.slow
-def test_what_was_measured_is_not_measured_again(tmp_path, monkeypatch):
+def test_what_was_measured_is_not_measured_again(tmp_path, monkeypatch, shared_data):
     """Would catch NEES that is of other blocks of the covariance."""
-    monkeypatch.setenv("JAXSLAM_DATA", str(DATA))
+    monkeypatch.setenv("JAXSLAM_DATA", str(shared_data))
     few = inertial.Inertial(
         trajectories=("udel_gore",), filters=("robocentric",), runs=8, steps=30, chunk=8,
         out=tmp_path / "x.json", docs=tmp_path,

@@ -113,9 +113,8 @@ def stacked(kind, frame):
     model, jacobians = linearised(frame)
     rng = np.random.default_rng(5)
     held = model.frame.from_base_pose(pose(SPATIAL, 1))
-    start = InertialState(
-        jnp.array([0.4, -0.2, 0.6]), jnp.zeros(3), jnp.zeros(3), jnp.asarray(DOWN)
-    )
+    velocity, none = jnp.array([0.4, -0.2, 0.6]), jnp.zeros(3)
+    start = InertialState(velocity, none, none, jnp.asarray(DOWN), jnp.zeros(0))
     core = Core(held, start, None, jnp.zeros(18), jnp.zeros(0))
     T_AC = model.view(core, COMPOSED).map_from_camera
     points = rng.uniform([-4, -4, 4], [4, 4, 12], (COUNT, 3))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,11 @@ def an_imu(**fields):
     turned = Rotation.from_euler("xyz", [0.3, -0.2, 1.4]).as_matrix()
     mounted = np.eye(4)
     mounted[:3] = np.column_stack([turned, [0.1, -0.05, 0.02]])
-    given = {"density": (2e-3, 3e-2), "walk": (1e-3, 2e-3), "camera_from_imu": mounted}
+    given: dict[str, Any] = {
+        "density": (2e-3, 3e-2),
+        "walk": (1e-3, 2e-3),
+        "camera_from_imu": mounted,
+    }
     return Imu(**{**given, **fields})
 
 
@@ -210,6 +215,7 @@ def test_what_is_told_of_the_start_is_off_by_its_sigma_and_readings_by_theirs():
     @jax.vmap
     def squared(key):
         run = simulate(world, key)
+        assert run.motion is not None
         (state, root), none = run.motion.start(), jnp.zeros(18)
         first = jax.tree.map(lambda x: x[0], run.controls)
 

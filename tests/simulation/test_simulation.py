@@ -14,6 +14,7 @@ from scipy import stats
 
 from jaxslam._numerics.arrays import cast
 from jaxslam.models.camera import Camera, project
+from jaxslam.models.imu import Imu
 from jaxslam.models.motion import ConstantVelocity, Odometry
 from jaxslam.models.sensors import Pinhole, Position
 from jaxslam.simulation import (
@@ -973,6 +974,8 @@ def test_what_no_field_says_of_an_inertial_unit_stays_when_others_change():
     world = scenario("imu", motion=dataclasses.replace(plain.motion, camera_from_imu=mounted))
     changed = scenario(world, steps=5)
     assert changed.steps == 5
+    assert isinstance(changed.motion, Imu)
+    assert isinstance(plain.motion, Imu)
     np.testing.assert_array_equal(changed.motion.camera_from_imu, mounted)
     np.testing.assert_array_equal(changed.motion.density, plain.motion.density)
 
