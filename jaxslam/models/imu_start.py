@@ -19,6 +19,7 @@ FAR = 4.0
 """Readings at rest are off by less than so many σ of a bias."""
 STILL = 0.01
 """σ of each number of the velocity of a unit at rest, m/s."""
+_increments = jax.jit(increments)
 _ANYWHERE = 1.0
 """σ of a direction before anything is read, rad: so wide that it does not matter."""
 
@@ -66,7 +67,7 @@ def moving(imu: Imu, seconds: Durations, gyroscope: Readings, accelerometer: Rea
     The force of T seconds in the axes of their beginning is `b_a − g d + (v_T − v_0)/T`, with both
     velocities of the model's σ. The biases are known no better than before.
     """
-    of = increments(seconds, gyroscope, accelerometer, imu.bias)
+    of = _increments(seconds, gyroscope, accelerometer, imu.bias)
     T, speed = of.seconds, imu.start_sigma[0]
     force = of.sped / T
     begun = replace(imu, velocity=np.zeros(3), start_sigma=(speed, _ANYWHERE), root=None)

@@ -121,9 +121,8 @@ def start_in_motion(
     window = Window(imu, stacked, camera_of(calibration), settings.depth, pixels, sigma)
     starts = np.zeros(3), *SPEED * directions(3, DIRECTIONS)
     best = min((_solved(window, velocity) for velocity in starts), key=lambda one: one.cost)
-    now, wide = _at_end(window, best)
-    root = np.linalg.qr(np.asarray(wide).T, mode="r").T
-    if (off := float(np.linalg.norm(root[:3], axis=1).max())) > SURE:
+    now, root = _at_end(window, best)
+    if (off := float(jnp.linalg.norm(root[:3], axis=1).max())) > SURE:
         raise ValueError(f"at the window's end the velocity is known to {off:.2g} m/s only")
     return imu.begun(now, root)
 
@@ -223,4 +222,4 @@ def _at_end(window: Window, at: Found) -> tuple[InertialState, jax.Array]:
     """The variables at the end, and a root of their covariance."""
     end = window.path(at.x)[1]
     J = jax.jacfwd(lambda x: difference(window.path(x)[1], end))(at.x)
-    return end, J @ cholesky(at.information).whitening.T
+    return end, jnp.linalg.qr(cholesky(at.information).whitening @ J.T, mode="r").T

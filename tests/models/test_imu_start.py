@@ -81,13 +81,13 @@ def test_at_rest_the_direction_of_gravity_and_the_bias_are_one_unknown():
 
 
 DOWN = np.array([0.0, 1.0, 0.0])
-SHAKEN = 9.81 * (0.05 * np.sin(np.arange(COUNT))[:, None] * DOWN - DOWN)
+SHAKEN = 9.81 * (0.3 * np.sin(np.arange(COUNT))[:, None] * DOWN - DOWN)
 
 
 @pytest.mark.parametrize(
     ("rates", "forces", "told"),
     [
-        (0.1 * np.sin(np.arange(COUNT) / 20)[:, None] * DOWN, -9.81 * DOWN, "rates scatter as of"),
+        (0.3 * np.sin(np.arange(COUNT) / 20)[:, None] * DOWN, -9.81 * DOWN, "rates scatter as of"),
         (0.0, SHAKEN, "specific forces scatter as of a density of"),
         (0.4 * DOWN, -9.81 * DOWN, "its mean rate is off by 0.4 rad/s"),
         (0.0, -11.0 * DOWN, r"its mean force by 1\.[12]"),
