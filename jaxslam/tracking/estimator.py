@@ -40,7 +40,6 @@ from jaxslam.filters.readouts import (
     log_unit,
 )
 from jaxslam.geometry import log, scaled
-from jaxslam.linalg import semidefinite_root
 from jaxslam.models.imu import Imu
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Status
@@ -65,7 +64,7 @@ class Predicted(NamedTuple):
     """A state of the filter before a frame's measurements, and what it expects of them."""
 
     control: Control
-    """Of the motion since the frame before: its seconds, or what an inertial unit tells."""
+    """The motion since the frame before: its seconds, or what an inertial unit reads."""
     state: Belief
     gaussian: Belief
     """The same as one Gaussian."""
@@ -405,7 +404,7 @@ def _going_on(slam: AbstractStaged, state: Belief | None) -> AbstractStaged:
     part = now.core.part("motion")
     size = part.stop - part.start
     # The length of gravity's direction has no variance, but for rounding.
-    root = semidefinite_root(now.covariance[part, part] + 1e-12 * jnp.eye(size)).root
+    root = jnp.linalg.cholesky(now.covariance[part, part] + 1e-12 * jnp.eye(size))
     started = slam.motion.begun(now.core.motion, root)
     wide = replace(started, root=None).start()[1]
     root = jnp.where(jnp.isfinite(root).all(), root, wide)

@@ -1,4 +1,4 @@
-"""An inertial unit beside the camera of a tracker: how it starts, and what a frame is told."""
+"""An inertial unit beside the camera of a tracker: how it starts, and what it reads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxslam.models.imu_start import at_rest, moving
 BEGINNING = 1.0
 """Seconds by whose readings the unit starts."""
 BIAS_SIGMA = 0.05, 0.2
-"""σ of the biases of a gyroscope, rad/s, and of an accelerometer, m/s², of which nothing is told:
+"""σ of the biases of a gyroscope, rad/s, and of an accelerometer, m/s², of which nothing is known:
 those of telephones and of units for robots."""
 
 

@@ -148,4 +148,4 @@ def test_what_is_missing_is_said(options, told, folder, tmp_path):
         for key, x in options.items()
     }
     with pytest.raises(ValueError, match=told):
-        TrackOptions(source=folder, out=tmp_path, **paths).run()
+        replace(TrackOptions(source=folder, out=tmp_path), **paths).run()

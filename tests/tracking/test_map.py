@@ -234,13 +234,13 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
 class Broken(Estimator):
     """Its covariance is not positive, whatever it is given."""
 
-    def empty(self):
+    def empty(self, before=None):
         return "empty"
 
-    def predict(self, state, seconds, livelier=1.0):
+    def predict(self, state, control, livelier=1.0):
         nothing = np.zeros(0)
         view = Prediction(nothing, nothing, nothing, nothing, nothing, nothing)
-        return Predicted(np.asarray(seconds), nothing, nothing, nothing, view)
+        return Predicted(np.asarray(control), nothing, nothing, nothing, view)
 
     def correct(self, predicted, seen=None):
         nothing = np.zeros(0)
