@@ -99,10 +99,8 @@ def test_a_lost_camera_goes_on_by_its_readings():
         off = np.linalg.norm((history[k].T_wc - of.source.reference.T_wc[k])[:3, 3])
         assert off < 3 * np.sqrt(np.trace(history[k].covariance[:3, :3])) < 0.1
     (mean, sigma), camera = of_motion(tracker), tracker.state.map.place.camera.T_wc
-    image = tracker.state.image
-    assert image is not None
     with jax.enable_x64(True):
-        tracker.state = tracker.state.restarted().begun(image, np.full((1, 2), 99.0))
+        tracker.state = tracker.state.restarted().begun(frame.image, np.full((1, 2), 99.0))
     assert tracker.state.map.number == 1
     np.testing.assert_array_equal(tracker.state.map.place.camera.T_wc, camera)
     after, now = of_motion(tracker)
