@@ -105,7 +105,7 @@ class MeasuredRun(eqx.Module):
         if self.motion is not None:
             if not hasattr(slam, "motion"):
                 raise ValueError(f"{type(slam).__name__} has no motion: it cannot begin as told")
-            slam = replace(slam, motion=self.motion)  # ty: ignore[invalid-argument-type]
+            slam = replace(slam, motion=self.motion)
         return slam.init(self.capacity, self.first, **known)
 
 
