@@ -134,22 +134,7 @@ class SlamModel(eqx.Module):
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
         noise = self._noises(core, context)[0]
-        return self._in_unit(core, noise, context.control)[0]
-
-    def _in_unit(
-        self, core: Core, noise: Float[Array, " q"], control: Control
-    ) -> tuple[Pose, Variables]:
-        """The displacement of a step and the motion's variables after it, in the unit of the state,
-        in which `_noises` are; where the control is in metres, by way of these."""
-        motion, metric = self.motion, not self.motion.has_velocity
-        if core.log_scale is None or not metric:
-            displacement = motion.displacement(core.motion, noise, control)
-            return displacement, motion.next(core.motion, noise, control)
-        metres = jnp.exp(core.log_scale[0])
-        variables, noise = motion.enlarged(core.motion, noise, metres)
-        displacement = scaled(motion.displacement(variables, noise, control), 1 / metres)
-        variables = motion.next(variables, noise, control)
-        return displacement, motion.enlarged(variables, noise, 1 / metres)[0]
+        return self.moved(core.motion, noise, context.control, core.log_scale)[0]
 
     def _noises(
         self, core: Core, context: Context
@@ -171,7 +156,7 @@ class SlamModel(eqx.Module):
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
         noise, drift = self._noises(core, context)
-        step, variables = self._in_unit(core, noise, context.control)
+        step, variables = self.moved(core.motion, noise, context.control, core.log_scale)
         delta = self.calibration.next(core.calibration, drift)
         moved, common = self.frame.moves_landmarks, core.depth_error
         if common is not None and self.depth.walk is not None:
@@ -189,17 +174,21 @@ class SlamModel(eqx.Module):
     def moved(
         self,
         variables: Variables,
-        delta: Float[Array, " k"],
         noise: Float[Array, " q"],
-        drift: Float[Array, " w"],
         control: Control,
-    ) -> tuple[Pose, Variables, Float[Array, " k"]]:
-        """The displacement of a step, and the motion's variables and the calibration after it."""
-        return (
-            self.motion.displacement(variables, noise, control),
-            self.motion.next(variables, noise, control),
-            self.calibration.next(delta, drift),
-        )
+        log_scale: Float[Array, " u"] | None = None,
+    ) -> tuple[Pose, Variables]:
+        """The displacement of a step and the motion's variables after it, in the unit of the state,
+        in which `_noises` are; where the control is in metres, by way of these."""
+        motion = self.motion
+        if log_scale is None or motion.has_velocity:
+            displacement = motion.displacement(variables, noise, control)
+            return displacement, motion.next(variables, noise, control)
+        metres = jnp.exp(log_scale[0])
+        variables, noise = motion.enlarged(variables, noise, metres)
+        displacement = scaled(motion.displacement(variables, noise, control), 1 / metres)
+        variables = motion.next(variables, noise, control)
+        return displacement, motion.enlarged(variables, noise, 1 / metres)[0]
 
     def camera_pose(self, core: Core) -> Pose:
         """T_BC, in metres."""

@@ -125,7 +125,8 @@ def _moved(slam: AbstractSlam, state, control, merged: Scalar, restarted: Bool[A
     anew = retract(mean, root @ numbers[: layout.start])
     variables = jax.tree.map(lambda new, old: jnp.where(restarted, new, old), anew, variables)
     noise = jnp.where(restarted, 0.0, noise)
-    step, variables, delta = slam.model.moved(variables, delta, noise, drift, control)
+    step, variables = slam.model.moved(variables, noise, control)
+    delta = slam.calibration.next(delta, drift)
     if layout.each:
         delta = jnp.asarray(slam.calibration.sigma) * numbers[layout.step :]
     return pose @ step, variables, delta
