@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,6 +87,8 @@ class TrackOptions:
     to infinity."""
     pixel_sigma: float = TrackerSettings.pixel_sigma
     """Standard deviation of a match, pixels."""
+    readout: Annotated[str, tyro.conf.arg(metavar="TIME")] = "0ms"
+    """Time from the first row's exposure to the last row's, of a rolling shutter, such as 20ms."""
     acceleration_sigma: float = TrackerSettings.acceleration_sigma
     """Standard deviation of the linear acceleration, map units/s²."""
     angular_acceleration_sigma: float = TrackerSettings.angular_acceleration_sigma
@@ -202,8 +205,19 @@ class TrackOptions:
             calibration=self.calibration_treatment,
             nearest_depth=self.nearest_depth,
             pixel_sigma=self.pixel_sigma,
+            readout=_seconds(self.readout),
             acceleration_sigma=self.acceleration_sigma,
             angular_acceleration_sigma=self.angular_acceleration_sigma,
             association=self.association,
             wanted=self.wanted,
         )
+
+
+def _seconds(time: str) -> float:
+    """The seconds of a time with a unit. Raises ValueError."""
+    found = re.fullmatch(r"\s*([\d.]+)\s*(s|ms|us|µs|)\s*", time)
+    try:
+        number, unit = found.groups() if found else ("none", "")
+        return float(number) * {"s": 1.0, "": 1.0, "ms": 1e-3}.get(unit, 1e-6)
+    except ValueError:
+        raise ValueError(f"--readout is a time such as 20ms or 0.02s, not {time!r}") from None

@@ -91,6 +91,7 @@ class CameraInMap(eqx.Module):
     map_from_camera: Pose
     """T_AC(k), the current camera in the map frame."""
     calibration: Float[Array, " k"]
+    """δ, and behind it the camera's velocity, where the sensor's rows depend on that."""
     anchors: SplitPose | None = None
     log_scale: Float[Array, " u"] | None = None
     depth_error: Float[Array, " 1"] | None = None
@@ -151,7 +152,14 @@ class SlamModel(eqx.Module):
         """All that a landmark depends on."""
         step = self.displacement(core, context)
         T_AC = self.frame.map_from_camera(core.pose, step)
-        return CameraInMap(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
+        delta = core.calibration
+        if self.sensor.rolling and core.motion is not None:
+            variables = core.motion
+            if context.control is not None:
+                noise = self._noises(core, context)[0]
+                variables = self.moved(variables, noise, context.control, core.log_scale)[1]
+            delta = self.in_motion(delta, variables)
+        return CameraInMap(T_AC, delta, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
@@ -244,9 +252,21 @@ class SlamModel(eqx.Module):
         sensor = self.sensor_at(view.calibration)
         return sensor.measure(point, omega), sensor.possible(point)
 
-    def sensor_at(self, delta: Float[Array, " k"]) -> AbstractSensor:
-        """The sensor whose calibration is off by δ."""
-        return self.calibration.sensor(self.sensor, delta)
+    def in_motion(self, delta: Float[Array, " k"], variables: Variables) -> Float[Array, " kt"]:
+        """δ, and behind it the motion's variables, where the sensor depends on its velocity."""
+        return jnp.concatenate([delta, variables]) if self.sensor.rolling else delta
+
+    def sensor_at(self, delta: Float[Array, " kt"], unit: Scalar | None = None) -> AbstractSensor:
+        """The sensor whose calibration is off by δ, at the velocity behind that, of which the unit
+        of length has so many metres; with one, metres are what it measures."""
+        own = jnp.size(self.calibration.sigma)
+        sensor = self.calibration.sensor(self.sensor, delta[:own])
+        if not sensor.rolling:
+            return sensor
+        velocity = delta[own:]
+        if unit is not None:
+            velocity, _ = self.motion.enlarged(velocity, velocity, unit)
+        return sensor.moving(velocity)
 
     def residual(self, measured: Array, predicted: Array) -> Array:
         """The difference of a measurement from its prediction."""
@@ -277,12 +297,13 @@ class SlamModel(eqx.Module):
         self, view: CameraInMap, measured: Array, hidden: Array, context: Context
     ) -> Array:
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
-        sensor = self.sensor_at(view.calibration)
+        unit = None if view.log_scale is None else jnp.exp(view.log_scale[0])
+        sensor = self.sensor_at(view.calibration, unit)
         if view.depth_error is not None:
             hidden = self.depth.with_common(hidden, view.depth_error)
         point, omega = sensor.locate(measured, hidden)
-        if view.log_scale is not None:
-            omega = omega * jnp.exp(view.log_scale[0])
+        if unit is not None:
+            omega = omega * unit
         seen = self.landmark.initialise(point, omega, jnp.asarray(sensor.focal))
         if self.landmark.anchored:
             return seen.at[-1].set(context.anchor)

@@ -215,6 +215,10 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
         correction.knows_gauge and frame.reanchors,
         f"{update} is not for {frame.name} filters, whose unobservable directions are not known",
     )
+    yield (
+        slam.sensor.rolling and not moves,
+        f"a rolling shutter is for a motion whose variables are a velocity; {motion} has others",
+    )
     if slam.mixture is not None:
         yield not estimated, f"a mixture divides a velocity: {motion} has none"
     if slam.start is not None:

@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.geometry import Pose, exp, identity, retract
+from jaxslam.geometry import Pose, exp, identity, log, retract
 from jaxslam.linalg import semidefinite_root
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import PriorMap
@@ -82,6 +82,8 @@ def simulate(
     motion_key, world_key, camera_key, pixel_key = jax.random.split(_as_key(key), 4)
     poses, controls, told = (_read_path if world.inertial else _path)(world, motion_key)
     sensors = world.calibration.sensors(world.sensor, camera_key, world.steps + 1)
+    if world.sensor.rolling:
+        sensors = jax.vmap(lambda sensor, v: sensor.moving(v))(sensors, _velocities(world, poses))
     points, new = world.placement.along(world, world_key, poses, sensors)
     every = jax.vmap(world.measured, in_axes=(0, 0, None if new is None else 0))
     measured, seen = every(poses, sensors, points)
@@ -214,6 +216,13 @@ def _path(world: World, key: Array) -> tuple[Pose, Control, None]:
     if world.reads:
         every = jax.vmap(motion.reading, in_axes=(None, 0))(control, noises)
     return _with_start(origin, poses, still), every, None
+
+
+def _velocities(world: World, poses: Pose) -> Float[Array, "frames t"]:
+    """The mean velocity of the step before every frame; in frame 0 that of the step after it."""
+    before, after = jax.tree.map(lambda x: x[:-1], poses), jax.tree.map(lambda x: x[1:], poses)
+    steps = jax.vmap(lambda a, b: log(a.inverse() @ b))(before, after) * world.rate
+    return jnp.concatenate([steps[:1], steps])
 
 
 def _with_start(start: Pose, poses: Pose, still: int = 0) -> Pose:

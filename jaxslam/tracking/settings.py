@@ -36,7 +36,8 @@ class TrackerSettings:
     """The assumptions of a tracker and how much it does.
 
     Lengths are in the unit of `nearest_depth`: a single camera does not see scale, so the map's
-    unit is whatever that prior makes it.
+    unit is whatever that prior makes it. Raises ValueError for names that are not known and for a
+    readout that is no time.
     """
 
     filter: str = "recommended+walk3+drift20"
@@ -67,6 +68,9 @@ class TrackerSettings:
     it is unknown in metres."""
     pixel_sigma: float = 0.3
     """σ of a match whose window fits, pixels; of the others it is larger (`noise_factors`)."""
+    readout: float = 0.0
+    """Seconds from the exposure of the first row to that of the last, of a rolling shutter; 0 of a
+    global one. A frame's time and pose are those of its middle row."""
     focal_sigma: float = 1.0
     """σ of the focal lengths, pixels, of a calibration that states none and is treated as named."""
     centre_sigma: float = 1.0
@@ -101,6 +105,8 @@ class TrackerSettings:
         lookup("association", [self.association], ASSOCIATIONS)
         if self.calibration is not None:
             lookup("calibration", [self.calibration], TREATMENTS)
+        if not 0 <= self.readout < np.inf:
+            raise ValueError(f"readout is a time of 0 s or more, not {self.readout} s")
 
     @property
     def capacity(self) -> int:
@@ -134,7 +140,11 @@ class TrackerSettings:
         return make_filter(
             self.filter,
             motion=motion or ConstantVelocity(accelerations, [0.0] * 6, velocities),
-            sensor=Pinhole(camera_of(calibration), self.pixel_sigma),
+            sensor=Pinhole(
+                camera_of(calibration),
+                self.pixel_sigma,
+                self.readout / calibration.height if self.readout else None,
+            ),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),
             depth=self.depth,

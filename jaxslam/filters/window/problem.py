@@ -37,6 +37,7 @@ class CalibratedPose(eqx.Module):
     pose: Pose
     """T_BC, B the camera of frame 0."""
     calibration: Float[Array, "*F k"]
+    """δ, and behind it the velocity, as in `CameraInMap`."""
 
 
 class Path(eqx.Module):
@@ -89,6 +90,7 @@ def path(slam: AbstractSlam, record: Record, x: X) -> Path:
     start, common, once, first, steps = jnp.split(x, ends)
     steps = steps.reshape(record.frames - 1, layout.step + layout.each)
     drawn = jnp.asarray(slam.calibration.sigma)
+    begin, in_motion = retract(mean, root @ start), slam.model.in_motion
 
     def move(state, data):
         k, *step = data
@@ -97,7 +99,7 @@ def path(slam: AbstractSlam, record: Record, x: X) -> Path:
         return there, there
 
     origin = identity(motion.geometry, x.dtype)
-    begun = origin, retract(mean, root @ start), drawn * (first if layout.each else once)
+    begun = origin, begin, in_motion(drawn * (first if layout.each else once), begin)
     data = (jnp.arange(record.frames - 1), *_driven_by(record), steps)
     _, later = jax.lax.scan(move, begun, data)
     poses, variables, deltas = jax.tree.map(
@@ -126,10 +128,10 @@ def _moved(slam: AbstractSlam, state, control, merged: Scalar, restarted: Bool[A
     variables = jax.tree.map(lambda new, old: jnp.where(restarted, new, old), anew, variables)
     noise = jnp.where(restarted, 0.0, noise)
     step, variables = slam.model.moved(variables, noise, control)
-    delta = slam.calibration.next(delta, drift)
+    delta = slam.calibration.next(delta[: slam.calibration.sigma.size], drift)
     if layout.each:
         delta = jnp.asarray(slam.calibration.sigma) * numbers[layout.step :]
-    return pose @ step, variables, delta
+    return pose @ step, variables, slam.model.in_motion(delta, variables)
 
 
 def located(
@@ -314,7 +316,8 @@ def _driven(
     _, root = slam.motion.start()
     sigma = jnp.asarray(slam.calibration.sigma)[:, None]
     pose = jnp.zeros((slam.motion.geometry.tangent_dim, x.size), x.dtype)
-    begun = jnp.concatenate([pose, root @ start, sigma * drawn])
+    moving = [root @ start] if slam.sensor.rolling else []
+    begun = jnp.concatenate([pose, root @ start, sigma * drawn, *moving])
     return begun, driving.reshape(record.frames - 1, -1, x.size)
 
 

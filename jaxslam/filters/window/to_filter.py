@@ -159,7 +159,7 @@ def _core(slam: AbstractSlam, like, newest, log_scale):
         pose=slam.frame.from_base_pose(scaled(frame.pose, unit)),
         motion=variables,
         log_scale=None if like.log_scale is None else like.log_scale.at[:1].set(log_scale),
-        calibration=frame.calibration if kept else like.calibration,
+        calibration=frame.calibration[: like.calibration.size] if kept else like.calibration,
         # The filter keeps c in σ of one landmark's prior.
         depth_error=None if like.depth_error is None else slam.depth.common * common,
         base_motion=None if like.base_motion is None else variables,
