@@ -281,6 +281,11 @@ class Estimator:
         mean, covariance = jax.device_get(_intrinsics(self.slam, state))
         return model.calibration.name, mean, covariance
 
+    def biases(self, state: Belief) -> tuple[np.ndarray, np.ndarray]:
+        """Return the biases of gyroscope, rad/s, and accelerometer, m/s², and their σ."""
+        mean, covariance = jax.device_get(_biases(self.slam, state))
+        return mean, np.sqrt(np.diagonal(covariance))
+
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
         """Start two threads that compile all programs in the order in which they are needed."""
         slam, state, still = self.slam, self.empty(), np.zeros(())
@@ -525,6 +530,11 @@ def _intrinsics(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Arr
         return sensor.camera.intrinsics
 
     return slam.marginal(state, intrinsics)
+
+
+@Program
+def _biases(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Array]:
+    return slam.marginal(state, lambda view: view.core.motion.bias)
 
 
 @Program

@@ -99,9 +99,12 @@ def summarised(
     if tracker.target is not None and tracker.sighting is not None:
         summary["target"] = as_summary(tracker.target, tracker.sighting)
     if (inertial := tracker.inertial) is not None:
+        biases, sigma = tracker.biases()
         summary["inertial"] = {
             "readings": inertial.log.name,
             "start": inertial.why_moving or "at rest",
+            "biases": biases.tolist(),
+            "biases_sigma": sigma.tolist(),
         }
         with suppress(ValueError):
             trajectories = *trajectory_of(history), *(source.reference or ([], []))

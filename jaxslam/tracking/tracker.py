@@ -351,6 +351,12 @@ class Tracker:
         with jax.enable_x64(True):
             return self.estimator.camera(self.state.map.state)
 
+    def biases(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the biases of an inertial unit, gyroscope (rad/s) before accelerometer (m/s²), and
+        their σ."""
+        with jax.enable_x64(True):
+            return self.estimator.biases(self.state.map.state)
+
     def save(self, path: str | Path) -> None:
         """Write all that is needed to go on from here (.npz), whole or not at all.
 

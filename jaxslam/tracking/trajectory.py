@@ -52,17 +52,19 @@ def write_covariances(
     covariances: ArrayLike,
     *,
     given_scale: bool = False,
+    length: str = "map",
     caveat: str = "",
 ) -> None:
     """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
-    They are of poses in the unit of their map; different units of different maps are not in them.
+    They are of poses in the unit of their map, or of `length`; different units of different maps
+    are not in them.
     With `given_scale` the filter has a unit of its own whose size in metres is uncertain. Otherwise
     it takes its unit for exactly known. The header says which, and the caveat if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     remark = "; ".join(filter(None, [_GIVEN_SCALE if given_scale else _KNOWN_SCALE, caveat]))
-    write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
+    write_pose_covariances(path, times, covariances, convention, length=length, remark=remark)
 
 
 def absolute_trajectory_error(

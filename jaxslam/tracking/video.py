@@ -154,8 +154,15 @@ def _write(
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
     caveat = caveat_of(tracker)
-    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     summary = summarised(source, tracker, history, points, seconds)
+    write_covariances(
+        out / "covariance.txt",
+        times,
+        covariances,
+        given_scale=scaled,
+        length=summary["unit"],
+        caveat=caveat,
+    )
     if "ate" in summary:
         assert source.reference is not None
         with suppress(ValueError):
