@@ -14,6 +14,7 @@ from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.source import Frame, Source
 from jaxslam.plots.tracking import plot_map
 from jaxslam.tracking.film import Aside, OverlayWriter
+from jaxslam.tracking.first_pass import finds_lens, with_lens_found
 from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.moving_start import begun
@@ -60,27 +61,30 @@ def track(
     frame sees, makes the map metric. `known` is the `map.npz` of another video by the same camera:
     this one goes on with that map where it is known again, by its settings. `inertial`, the
     readings of an inertial unit, make all lengths metres; where it moves in the beginning, the
-    first 1.5 s are used for its start alone. `viewer` is a file for the rerun viewer,
+    first 1.5 s are used for its start alone. Where the calibration is guessed, the first frames of
+    a recording are tracked twice, once to find the lens. `viewer` is a file for the rerun viewer,
     FILE.rrd, written beside the others.
     """
+    out, begins = Path(out), time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:
         settings = settings or TrackerSettings()
         if inertial is not None:
             source, inertial = begun(source, inertial, settings)
+        elif slam is None and source.clock is None and finds_lens(source, settings):
+            source = with_lens_found(source, settings, out)
         tracker = Tracker(source.calibration, settings, slam, target, inertial)
     else:
         tracker = Tracker.localising(known, source.calibration, slam)
     if source.clock is not None:
         tracker.compile()
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
     seconds: list[float] = []
     try:
         film = out / "overlay.mp4" if overlay else None
         with _shown(source, tracker, film, recording, history) as show:
-            start = time.perf_counter()
+            start = begins
             for frame in source:
                 history.append(tracker.track(frame))
                 add_latest(out, history)
