@@ -23,7 +23,7 @@ from jaxslam.io.source import Frame, check_size
 from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
-from jaxslam.tracking.estimator import Correction, Estimator
+from jaxslam.tracking.estimator import LIVELY, Correction, Estimator
 from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState, in_view
@@ -171,11 +171,14 @@ def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> 
     seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
     # What an inertial unit feels is no jerk.
     if not lost and estimator.inertial is None and state.map.place.unit_fixed:
-        jerked = estimator.predict(state.map.state, predicted.control, JERK)
-        if reason is not None or estimator.likelier(jerked, predicted, seen):
-            found, why, wavers = policy.observed(frame.image, state, jerked, lost=lost)
-            if why is None:
-                predicted, seen, reason, doubtful = jerked, found, None, wavers
+        nis, _ = estimator.nis(predicted, seen.labelled("matched"))
+        # One that is less than the fall by which another prediction is likelier cannot fall so.
+        if reason is not None or nis > LIVELY:
+            jerked = estimator.predict(state.map.state, predicted.control, JERK)
+            if reason is not None or estimator.likelier(jerked, predicted, seen):
+                found, why, wavers = policy.observed(frame.image, state, jerked, lost=lost)
+                if why is None:
+                    predicted, seen, reason, doubtful = jerked, found, None, wavers
     # Of two motions that contradict each other a place that is known says no more: it is one of
     # both.
     elsewhere = state.elsewhere or reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
