@@ -29,7 +29,7 @@ be used again."""
 
 
 def finds_lens(source: Source, settings: TrackerSettings) -> bool:
-    """Whether the lens is a guess, and is to be estimated."""
+    """Whether the lens is a guess, which the tracker estimates."""
     return source.calibration.guessed and settings.calibration in (None, "estimated")
 
 
