@@ -3,6 +3,6 @@
 from jaxtyping import install_import_hook
 
 install_import_hook(
-    ["exact_posterior", "modes", "modes_figure", "tracks"],
+    ["modes", "modes_figure", "tracks"],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
