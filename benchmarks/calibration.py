@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_page
+from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes, filter_run
@@ -87,8 +87,8 @@ class CalibrationStudy(Benchmark):
                 results[name][truth] = _measure(scenario, runs, room, self)
                 yield {**of, "scenarios": results}
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_page(self.docs / "calibration.md", page(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "calibration.md", "", page(results)
 
 
 def draw(scenario: Scenario, options: CalibrationStudy) -> list[tuple[Run, Room]]:

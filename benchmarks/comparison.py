@@ -7,14 +7,14 @@ and `docs/comparison.md`.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-from benchmark import RESULTS, Benchmark, number, table, write_page
+from benchmark import RESULTS, Benchmark, at_end, number, studied, table
 
 import jaxslam
 
@@ -37,41 +37,33 @@ class Comparison(Benchmark):
     def measure(self) -> Iterator[dict[str, Any]]:
         """`{"scenarios": {scenario: {"filter/landmarks": numbers at the end}}}` and what it is of,
         after every filter."""
-        results: dict[str, dict[str, Any]] = {name: {} for name in self.scenarios}
         of = {"schema": 1, "version": jaxslam.__version__, "runs": self.runs, "seed": self.seed}
         of["device"] = jax.devices()[0].device_kind
         # Filter by filter, so that scenarios of one shape share its compiled program.
-        for landmarks, frame in itertools.product(self.landmarks, self.filters):
-            for name in self.scenarios:
-                numbers = _measure(name, frame, landmarks, self)
-                results[name][f"{frame}/{landmarks}"] = numbers
-                print(name, f"{frame}/{landmarks}", json.dumps(numbers), flush=True)
-            yield {**of, "scenarios": results}
+        each = itertools.product(self.landmarks, self.filters, self.scenarios)
+        for results in self.added(
+            (
+                ("scenarios", scenario, f"{frame}/{landmarks}"),
+                {"runs": self.runs},
+                partial(self._measured, scenario, f"{frame}/{landmarks}"),
+            )
+            for landmarks, frame, scenario in each
+        ):
+            yield of | {"scenarios": results["scenarios"]}
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_page(self.docs / "comparison.md", page(results))
+    def _measured(self, name: str, slam: str) -> dict[str, Any]:
+        scenario = jaxslam.scenario(name)
+        _, found = studied(scenario, slam, runs=self.runs, seed=self.seed)
+        row = at_end(found)
+        rmse, sigma = row["rmse"], row.pop("sigma")
+        microseconds = 1e6 * found["seconds"]["run"] / self.runs / scenario.steps
+        return row | {
+            "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
+            "microseconds_per_step": round(microseconds, 1),
+        }
 
-
-def _measure(name: str, frame: str, landmarks: str, options: Comparison) -> dict[str, Any]:
-    scenario = jaxslam.scenario(name)
-    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
-    study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
-    (f,) = jaxslam.summarise(study)["filters"].values()
-    rmse, sigma = f["rmse"]["position"][-1], f["sigma"]["position"][-1]
-    microseconds = 1e6 * f["seconds"]["run"] / options.runs / scenario.steps
-    return {
-        "runs": options.runs,
-        "dof": f["dof"],
-        "band95": f["band95"],
-        "nees": f["nees"][-1],
-        "nees_median": f["nees_median"][-1],
-        "inside": f["inside"],
-        "lost": f["lost"][-1],
-        "diverged": f["diverged"],
-        "rmse": rmse,
-        "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
-        "microseconds_per_step": round(microseconds, 1),
-    }
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "comparison.md", "", page(results)
 
 
 def page(summary: dict[str, Any]) -> str:
@@ -117,12 +109,15 @@ def _cell(found: dict[str, Any] | None, runs: int) -> str:
 
 def _parametrizations() -> str:
     """All of them, as a Markdown table."""
-    rows = [
-        f"| `{p.name}` | {p.parameters} | {p.size(3)} ({p.size(2)}) | {p.point} | {p.source} |"
-        for p in jaxslam.LANDMARKS.values()
-    ]
-    head = "| name | parameters | numbers, spatial (planar) | point | source |"
-    return "\n".join([head, "|---|---|---|---|---|", *rows])
+    header = "name", "parameters", "numbers, spatial (planar)", "point", "source"
+    all_of_them = jaxslam.LANDMARKS.values()
+    return table(
+        header,
+        (
+            (f"`{p.name}`", p.parameters, f"{p.size(3)} ({p.size(2)})", p.point, p.source)
+            for p in all_of_them
+        ),
+    )
 
 
 def _table(results: dict[str, dict[str, Any]], runs: int) -> str:

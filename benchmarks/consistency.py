@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import END, RESULTS, Benchmark, write_page, write_table
+from benchmark import END, RESULTS, Benchmark, at_end, studied, table
 from verdicts import BEGIN
 from verdicts import as_table as table_of_verdicts
 
@@ -31,8 +31,6 @@ from jaxslam.statistics import Tally, mean_band
 Row = dict[str, Any]
 Results = dict[str, dict[str, Row]]
 """`results[scenario][filter/landmarks]`: what `measure` returns of one seed, `together` of more."""
-LAYOUT = 3
-"""Of a row; what has another is measured again."""
 TALLIES = ("tally", "one_scale", "drift")
 VERDICTS = RESULTS / "verdicts.json"
 MARK = "<!-- consistency.py -->"
@@ -65,9 +63,6 @@ class Consistency(Benchmark):
     """Runs in one batch."""
     out: Path = RESULTS / "consistency.json"
 
-    def found(self) -> Results:
-        return read(self.out)
-
     def measure(self) -> Iterator[Results]:
         for scenario_name in self.scenarios:
             scenario = jaxslam.scenario(scenario_name)
@@ -82,35 +77,28 @@ class Consistency(Benchmark):
     def save(self, results: Results) -> None:
         """`add_to` has done it, as other commands add to the file too."""
 
-    def report(self, results: Results) -> None:
-        write_page(self.docs / "consistency.md", page(results))
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
+        yield "consistency.md", "", page(results)
         if self.page:
-            write_table(self.docs.parent / "README.md", MARK, recommended(results, IN_README))
-            write_table(self.docs / "results.md", MARK, beside(results))
+            yield "../README.md", MARK, recommended(results, IN_README)
+            yield "results.md", MARK, beside(results)
 
 
 def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Consistency) -> Row:
     """One filter on one seed: numbers from which those of many seeds follow."""
-    frame, landmarks = name.rsplit("/", 1)
-    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
-    study = jaxslam.monte_carlo(
-        scenario, filters, runs=options.runs, seed=seed, chunk=options.chunk
-    )
-    ((key, f),) = jaxslam.summarise(study)["filters"].items()
+    study, f = studied(scenario, name, runs=options.runs, seed=seed, chunk=options.chunk)
+    (key,) = study.filters
     nis = np.sum(np.array(f["nis"], float)) / np.sum(np.array(f["nis_dof"], float))
+    last = at_end(f)
     return {
-        "layout": LAYOUT,
         "seeds": [seed],
         "runs": options.runs,
         "tally": tally(study, key).asdict(),
         "one_scale": tally(study, key, "beyond_scale").asdict(),
         "drift": tally(study, key, "drift").asdict(),
         "nees": f["nees"],
-        "lost": round(f["lost"][-1] * options.runs),
-        "nees_median": f["nees_median"][-1],
-        "nees_not_lost": f["nees_not_lost"][-1],
-        "rmse": f["rmse"]["position"][-1],
-        "sigma": f["sigma"]["position"][-1],
+        "lost": round(last["lost"] * options.runs),
+        **{of: last[of] for of in ("nees_median", "nees_not_lost", "rmse", "sigma")},
         "nis_per_dof": float(nis),
         "microseconds_per_step": 1e6 * f["seconds"]["run"] / options.runs / scenario.steps,
     }
@@ -132,14 +120,13 @@ def together(one: Row, other: Row) -> Row:
     def root(key: str) -> np.ndarray:
         return np.sqrt(_weighed(np.array([row[key] for row in both], float) ** 2, survivors))
 
+    of_seeds = "nees_median", "nis_per_dof", "microseconds_per_step"
     numbers = {
         "nees_not_lost": mean("nees_not_lost", kept),
-        **{key: mean(key, seeds) for key in ("nees_median", "nis_per_dof")},
-        "microseconds_per_step": mean("microseconds_per_step", seeds),
+        **{key: mean(key, seeds) for key in of_seeds},
         **{key: root(key) for key in ("rmse", "sigma")},
     }
     return {
-        "layout": LAYOUT,
         "seeds": sorted(one["seeds"] + other["seeds"]),
         "runs": one["runs"] + other["runs"],
         "lost": one["lost"] + other["lost"],
@@ -200,17 +187,16 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
             "- †: measured before verdicts looked at thirds and at drift: the verdict is of all",
             "  steps and the last one, and *ever* uses the quantile of a single step.",
         ]
-    lines += [
-        "",
-        "| scenario, filter | NEES, all steps | σ should be × | verdict "
-        f"| at one scale; drift | NEES at steps {', '.join(map(str, STEPS))}, last "
-        "| lost; ever | RMSE; σ, m |",
-        f"|{'---|' * COLUMNS}",
-    ]
+    steps = ", ".join(map(str, STEPS))
+    header = [
+        "scenario, filter", "NEES, all steps", "σ should be ×", "verdict", "at one scale; drift",
+        f"NEES at steps {steps}, last", "lost; ever", "RMSE; σ, m",
+    ]  # fmt: skip
+    cells: list[list[str]] = []
     for name, filters in results.items():
-        lines.append(f"| **`{name}`** {'|' * COLUMNS}")
-        lines += [_row(key, row) for key, row in filters.items()]
-    return "\n".join([*lines, *_of_verdicts(verdicts)]) + "\n"
+        cells.append([f"**`{name}`**", *[""] * (len(header) - 1)])
+        cells += [_row(key, row) for key, row in filters.items()]
+    return "\n".join([*lines, "", table(header, cells), *_of_verdicts(verdicts)]) + "\n"
 
 
 def in_words(results: Results) -> list[str]:
@@ -270,85 +256,79 @@ def _of_verdicts(path: Path) -> list[str]:
     ]
 
 
-COLUMNS = 8
 BRIEF = {"consistent": "yes", "over-confident": "over", "under-confident": "under"}
 
 
-def _row(name: str, row: Row) -> str:
+def _row(name: str, row: Row) -> list[str]:
     told = verdicts_of(row)
     verdict, mean = told["tally"], told["tally"]["mean"]
-    decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
     survivors = row["runs"] - row["tally"]["diverged"]
     low, high = mean_band(row["tally"]["dof"], max(survivors, 1))
     if verdict["nees"] is None:
         low, high = np.inf, -np.inf
     steps = (*(s - 1 for s in STEPS if s < len(row["nees"])), -1)
-    nees = [_number(row["nees"][step]) for step in steps]
+    nees = [np.nan if row["nees"][step] is None else row["nees"][step] for step in steps]
     brief = (BRIEF.get(told[key]["word"], "?") for key in TALLIES[1:] if key in told)
-    cells = [
+    return [
         f"`{label(name)}`{'' if 'drift' in row else ' †'}",
         _short(mean["nees"]),
-        _factor(mean, 2),
-        f"{verdict['word']}{decided}",
+        _factor(mean),
+        _decided(verdict),
         "; ".join(brief) or "–",
         " ".join(f"**{_short(n)}**" if low <= n <= high else _short(n) for n in nees),
         f"{row['lost'] / row['runs']:.2%}; {verdict['lost']:.2%}",
         f"{row['rmse']:.3f}; {row['sigma']:.3f}",
     ]
-    return f"| {' | '.join(cells)} |"
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
+def _decided(verdict: dict[str, Any]) -> str:
+    """The word, and the part that decided."""
+    part = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
+    return f"{verdict['word']}{part}"
 
 
 def recommended(results: Results, scenarios: Iterable[str]) -> str:
     """The table of the paper's filter and the recommended one, by scenario."""
-    rows = [
-        "| scenario | filter | NEES: all; last | σ should be × | verdict | lost | RMSE, σ, m |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for scenario in scenarios:
-        for name, row in results[scenario].items():
-            if label(name) in ("robocentric", "recommended"):
-                rows.append(f"| `{scenario}` | `{label(name)}` {_cells(row)}")
-    return "\n".join(rows)
+    header = (
+        "scenario", "filter", "NEES: all; last", "σ should be ×", "verdict", "lost", "RMSE, σ, m"
+    )  # fmt: skip
+    rows = []
+    for scenario, (name, row) in ((of, item) for of in scenarios for item in results[of].items()):
+        if label(name) in ("robocentric", "recommended"):
+            verdict = verdicts_of(row)["tally"]
+            rows.append(
+                (
+                    *(f"`{scenario}`", f"`{label(name)}`"),
+                    f"{_short(verdict['mean']['nees'])}; {_short(row['nees'][-1])}",
+                    *(_factor(verdict["mean"]), _decided(verdict)),
+                    f"{row['lost'] / row['runs']:.1%}",
+                    f"{row['rmse']:.3f}, {row['sigma']:.3f}",
+                )
+            )
+    return table(header, rows)
 
 
 def beside(results: Results) -> str:
     """The same numbers in short, a row for each scenario."""
-    columns = "`robocentric`: σ should be ×; lost | `recommended`: σ should be ×; lost; verdict"
-    rows = [f"| scenario | {columns} |", "|---|---|---|"]
+    rows = []
     for scenario, filters in results.items():
         of = {label(name): row for name, row in filters.items()}
         told = {name: verdicts_of(of[name])["tally"] for name in ("robocentric", "recommended")}
         cells = [
-            f"{_factor(verdict['mean'], 2)}; {of[name]['lost'] / of[name]['runs']:.1%}"
+            f"{_factor(verdict['mean'])}; {of[name]['lost'] / of[name]['runs']:.1%}"
             for name, verdict in told.items()
         ]
-        word, part = told["recommended"]["word"], told["recommended"]["of"]
-        decided = "" if part == "all steps" else f" ({part})"
-        rows.append(f"| `{scenario}` | {' | '.join(cells)}; {word}{decided} |")
-    return "\n".join(rows)
+        cells[-1] += f"; {_decided(told['recommended'])}"
+        rows.append((f"`{scenario}`", *cells))
+    columns = "`robocentric`: σ should be ×; lost", "`recommended`: σ should be ×; lost; verdict"
+    return table(("scenario", *columns), rows)
 
 
-def _cells(row: Row) -> str:
-    verdict = verdicts_of(row)["tally"]
-    mean = verdict["mean"]
-    decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
-    return (
-        f"| {_short(mean['nees'])}; {_short(row['nees'][-1])} | {_factor(mean, 2)} "
-        f"| {verdict['word']}{decided} | {row['lost'] / row['runs']:.1%} "
-        f"| {row['rmse']:.3f}, {row['sigma']:.3f} |"
-    )
-
-
-def _factor(found: dict[str, Any], digits: int = 3) -> str:
+def _factor(found: dict[str, Any]) -> str:
     factor, (low, high) = found["sigma_factor"], found["interval99"]
     if factor is None:
         return _short(factor)
-    told = "–" if high is None else f"{high:.{digits}f}"
-    return f"{factor:.{digits}f} [{low:.{digits}f}, {told}]"
+    return f"{factor:.2f} [{low:.2f}, {'–' if high is None else f'{high:.2f}'}]"
 
 
 def named(seeds: Iterable[int]) -> str:
@@ -366,19 +346,9 @@ def _short(value: float | None) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
-def read(path: Path) -> Results:
-    """The rows of this layout that a file holds; none where there is no file."""
-    found: Results = json.loads(path.read_text()) if path.exists() else {}
-    return {
-        scenario: {name: row for name, row in filters.items() if row.get("layout") == LAYOUT}
-        for scenario, filters in found.items()
-    }
-
-
 def add_to(path: Path, scenario: str, name: str, found: Row) -> None:
     """Write the file, read anew as others add to it, with a seed more, unless it is there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    results = read(path)
+    results: Results = json.loads(path.read_text()) if path.exists() else {}
     filters = results.setdefault(scenario, {})
     there = filters.get(name)
     if there is None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, table, write_table
+from benchmark import RESULTS, Benchmark, studied, table
 from modes import modes_of_run
 from modes_figure import plot_modes, worlds_of
 
@@ -69,33 +70,24 @@ class FromRest(Benchmark):
         if self.figure:
             draw_figure(self)
             return
-        results = self.found()
-        for scenario, name in itertools.product(self.scenarios, self.filters):
-            there = results.setdefault(scenario, {}).get(name, {})
-            if (there.get("runs"), there.get("seed")) != (self.runs, self.seed):
-                results[scenario][name] = measure(self, scenario, name)
-                yield results
+        of = {"runs": self.runs, "seed": self.seed}
+        yield from self.added(
+            ((scenario, name), of, partial(self._measured, scenario, name))
+            for scenario, name in itertools.product(self.scenarios, self.filters)
+        )
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "from-rest.md", BEGIN, as_table(results))
-        write_table(self.docs / "from-rest.md", SAID, sentences(results))
+    def _measured(self, scenario: str, name: str) -> dict[str, Any]:
+        sizes = {"runs": self.runs, "seed": self.seed, "chunk": self.chunk}
+        _, found = studied(jaxslam.scenario(scenario), name, **sizes)
+        return {
+            **{key: found[key] for key in KEYS},
+            "milliseconds_per_run": 1e3 * found["seconds"]["run"] / self.runs,
+            "compile": found["seconds"]["compile"],
+        }
 
-
-def measure(options: FromRest, scenario: str, name: str) -> dict[str, Any]:
-    """One filter in one scenario."""
-    world = jaxslam.scenario(scenario)
-    filters = jaxslam.make_filters(world, [name], ["inverse_scaling"])
-    study = jaxslam.monte_carlo(
-        world, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
-    )
-    ((_, found),) = jaxslam.summarise(study)["filters"].items()
-    return {
-        "runs": options.runs,
-        "seed": options.seed,
-        **{key: found[key] for key in KEYS},
-        "milliseconds_per_run": 1e3 * found["seconds"]["run"] / options.runs,
-        "compile": found["seconds"]["compile"],
-    }
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "from-rest.md", BEGIN, as_table(results)
+        yield "from-rest.md", SAID, sentences(results)
 
 
 def as_table(results: dict[str, dict[str, Any]]) -> str:

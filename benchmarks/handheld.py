@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import tracks
-from benchmark import RESULTS, Benchmark, data_folder, table, write_table
+from benchmark import RESULTS, Benchmark, Case, data_folder, table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
@@ -80,31 +80,25 @@ class Handheld(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one filter at a time."""
-        results = self.found()
-        for where, name, wanted, measure in _studies(self):
-            found = results.setdefault(where, {}).get(name)
-            if not found or any(found.get(key) != value for key, value in wanted.items()):
-                results[where][name] = {**wanted, **measure()}
-                print(f"{name}: {' | '.join(_row(where, results[where][name]))}", flush=True)
-                yield results
+        yield from self.added(_studies(self))
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "handheld.md", MARK, as_table(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "handheld.md", MARK, as_table(results)
 
 
-def _studies(options: Handheld) -> Iterator[tuple[str, str, dict[str, int], Any]]:
-    """Of what, by which filter, of how many runs, and the function that measures it."""
+def _studies(options: Handheld) -> Iterator[Case]:
+    """Along every trajectory and on every drive, each filter."""
     simulated = {"runs": options.runs, "steps": options.steps, "seed": options.seed}
     recorded = {"runs": options.starts, "steps": options.frames}
     data = data_folder()  # where scenarios find them too
     for trajectory in options.trajectories or _known("trajectories/*.txt", "kitti_format"):
-        chosen = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
-        for name, slam in _filters(chosen, options).items():
-            yield chosen.name, name, simulated, partial(_simulated, chosen, name, slam, options)
+        world = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
+        for name, slam in _filters(world, options).items():
+            yield (world.name, name), simulated, partial(_simulated, world, name, slam, options)
     for drive in options.drives or _known("kitti_tracks/*/tracks.npz"):
         drove = tracks.read(data / "kitti_tracks" / drive)
         for name, slam in _filters(on_the_road(drove), options).items():
-            yield f"tracks-{drive}", name, recorded, partial(_recorded, drove, slam, options)
+            yield (f"tracks-{drive}", name), recorded, partial(_recorded, drove, slam, options)
 
 
 def _known(pattern: str, without: str = " ") -> list[str]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, Benchmark, by_batch, number, table
 
 import jaxslam
 from jaxslam.consistency import draw, run_through
@@ -55,15 +55,12 @@ class Inertial(Benchmark):
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[trajectory][filter]`: NEES per degree of freedom of orientation and position, of every
         third and of the last second, and the share of lost runs."""
-        results = self.found()
-        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        for trajectory in self.trajectories:
-            for name in self.filters:
-                row = results.setdefault(trajectory, {}).get(name, {})
-                if any(row.get(key) != value for key, value in wanted.items()):
-                    found = self._measured(trajectory, name)
-                    results[trajectory][name] = wanted | found
-                    yield results
+        of = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
+        yield from self.added(
+            ((trajectory, name), of, partial(self._measured, trajectory, name))
+            for trajectory in self.trajectories
+            for name in self.filters
+        )
 
     def _measured(self, trajectory: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario("imu", RECIPE, trajectory=trajectory, sway=[], steps=self.steps)
@@ -117,14 +114,9 @@ def _of_runs(slam, world, options: Inertial) -> tuple[np.ndarray, np.ndarray]:
         return [(normalised_squared(e, covariance[part, part]), e @ e) for e, part in errors]
 
     room, runs = draw(world, options.runs, seed=options.seed)
-    one = partial(run_through, slam, room, output=told)
-    batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
-    parts = [
-        jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))
-        for i in range(0, options.runs, options.chunk)
-    ]
-    runs_first = [np.moveaxis(np.array(part), (0, 1), (-2, -1)) for part in parts]
-    whole = np.concatenate(runs_first, axis=0)
+    batch = jax.jit(jax.vmap(lambda run: run_through(slam, room, run, told)[1]))
+    # Of two parts, each NEES and error: runs, steps, part.
+    whole = np.moveaxis(np.array(by_batch(batch, runs, options.chunk)), (0, 1), (-2, -1))
     return whole[..., 0], whole[..., 1]
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, Benchmark, by_batch, number, table
 from jaxtyping import Array, Bool
 
 import jaxslam
@@ -91,7 +91,7 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]
         run = jax.jit(jax.vmap(partial(filter_run, slam, room, sensor)))
-        records = _concatenated(run(part) for part in _parts(runs, options.chunk))
+        records = by_batch(run, runs, options.chunk)
         if reference is None:
             reference = records["information"]
         yield pair, summarise(records, reference)
@@ -205,16 +205,6 @@ def _landmark_numbers(good: dict, known, ever, which) -> dict | None:
         "bias_median": float(np.median(errors)) if errors.size else None,
         "spread": float(np.sqrt((errors**2).mean())) if errors.size else None,
     }
-
-
-def _parts(runs: Run, size: int) -> Iterator[Run]:
-    for start in range(0, runs.visible.shape[0], size):
-        yield jax.tree.map(lambda x, s=start: x[s : s + size], runs)
-
-
-def _concatenated(parts: Iterator[dict]) -> dict[str, np.ndarray]:
-    fetched = [jax.device_get(part) for part in parts]
-    return {key: np.concatenate([part[key] for part in fetched]) for key in fetched[0]}
 
 
 HEADER = (

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark
+from benchmark import RESULTS, Benchmark, studied
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -57,19 +58,16 @@ class LongRuns(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[scenario][filter]`: mean and median NEES and the share of lost runs `at` some steps."""
-        results = self.found()
-        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        for scenario in self.scenarios:
-            for name in self.filters:
-                row = results.setdefault(scenario, {}).get(name, {})
-                if any(row.get(key) != value for key, value in wanted.items()):
-                    results[scenario][name] = wanted | self._measured(scenario, name)
-                    yield results
+        of = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
+        yield from self.added(
+            ((scenario, name), of, partial(self._measured, scenario, name))
+            for scenario in self.scenarios
+            for name in self.filters
+        )
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario(scenario, {"steps": self.steps})
-        study = jaxslam.monte_carlo(world, [name], runs=self.runs, seed=self.seed, chunk=self.chunk)
-        (found,) = jaxslam.summarise(study)["filters"].values()
+        _, found = studied(world, name, runs=self.runs, seed=self.seed, chunk=self.chunk)
         at = np.unique(np.geomspace(FIRST, self.steps, MOST).round().astype(int)).tolist()
         kept = {key: [found[key][k - 1] for k in at] for key in ("nees", "nees_median", "lost")}
         seconds = found["seconds"]["run"]

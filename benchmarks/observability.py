@@ -10,11 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, Benchmark, at_end, number, studied, table
 
 import jaxslam
 from jaxslam.consistency import Study
@@ -25,27 +26,16 @@ class Observability(Benchmark):
     """Every filter in every scenario; `--page` prints the table of what is there."""
 
     filters: tuple[str, ...] = (
-        "robocentric/inverse_scaling",
-        "robocentric+oc/inverse_scaling",
-        "world/inverse_scaling",
-        "world+oc/inverse_scaling",
-        "world+fej/inverse_scaling",
-        "world+fej2/inverse_scaling",
-        "world+decoupled/inverse_scaling",
-        "invariant/inverse_scaling",
-        "robocentric/inverse_depth",
-        "robocentric+oc/inverse_depth",
-        "world/inverse_depth",
-        "world+oc/inverse_depth",
-    )
+        "robocentric/inverse_scaling", "robocentric+oc/inverse_scaling",
+        "world/inverse_scaling", "world+oc/inverse_scaling", "world+fej/inverse_scaling",
+        "world+fej2/inverse_scaling", "world+decoupled/inverse_scaling",
+        "invariant/inverse_scaling", "robocentric/inverse_depth", "robocentric+oc/inverse_depth",
+        "world/inverse_depth", "world+oc/inverse_depth",
+    )  # fmt: skip
     """`filter/landmarks`."""
     scenarios: tuple[str, ...] = (
-        "matched",
-        "matched-loose",
-        "matched-forward",
-        "matched-forward-loose",
-        "circle",
-    )
+        "matched", "matched-loose", "matched-forward", "matched-forward-loose", "circle",
+    )  # fmt: skip
     runs: int = 200
     """Runs of every filter."""
     seed: int = 0
@@ -53,39 +43,20 @@ class Observability(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add to `{scenario: {"filter/landmarks": numbers at the end}}`."""
-        rows = self.found().get("scenarios", {})
+        of = {"runs": self.runs, "seed": self.seed}
         # Filter by filter, so that scenarios of one shape share its compiled program.
-        for name, scenario in itertools.product(self.filters, self.scenarios):
-            done = rows.setdefault(scenario, {})
-            if done.get(name, {}).get("runs") != self.runs:
-                done[name] = _measure(name, scenario, self)
-                yield {"schema": 1, "scenarios": rows}
+        yield from self.added(
+            (("scenarios", scenario, name), of, partial(self._measured, name, scenario))
+            for name, scenario in itertools.product(self.filters, self.scenarios)
+        )
+
+    def _measured(self, name: str, scenario: str) -> dict[str, Any]:
+        study, found = studied(jaxslam.scenario(scenario), name, runs=self.runs, seed=self.seed)
+        seconds = round(found["seconds"]["run"] / self.runs, 4)
+        return at_end(found) | {"along": _along(study, name), "seconds_per_run": seconds}
 
     def report(self, results: dict[str, Any]) -> None:
         print(as_table(results["scenarios"]), flush=True)
-
-
-def _measure(name: str, scenario_name: str, options: Observability) -> dict[str, Any]:
-    scenario = jaxslam.scenario(scenario_name)
-    kind, landmarks = name.split("/")
-    filters = jaxslam.make_filters(scenario, [kind], [landmarks])
-    study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
-    (f,) = jaxslam.summarise(study)["filters"].values()
-    return {
-        "runs": options.runs,
-        "seed": options.seed,
-        "band95": f["band95"],
-        "nees": f["nees"][-1],
-        "nees_median": f["nees_median"][-1],
-        "nees_not_lost": f["nees_not_lost"][-1],
-        "lost": f["lost"][-1],
-        "diverged": f["diverged"],
-        "inside": f["inside"],
-        "rmse": f["rmse"]["position"][-1],
-        "sigma": f["sigma"]["position"][-1],
-        "along": _along(study, name),
-        "seconds_per_run": round(f["seconds"]["run"] / options.runs, 4),
-    }
 
 
 def _along(study: Study, name: str) -> dict[str, float]:
@@ -106,14 +77,9 @@ def _along(study: Study, name: str) -> dict[str, float]:
 def as_table(rows: dict[str, dict[str, Any]]) -> str:
     """All scenarios as one Markdown table."""
     header = (
-        "scenario",
-        "filter",
-        "NEES mean / median",
-        "lost",
-        "inside",
-        "RMSE / σ, m",
+        "scenario", "filter", "NEES mean / median", "lost", "inside", "RMSE / σ, m",
         "along the path: median error / σ, m",
-    )
+    )  # fmt: skip
     lines = [
         (
             f"`{scenario}`" if i == 0 else "",

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, run_one, table
 from published_worlds import localisation, make, zhang
 from tyro.conf import Positional
 
@@ -289,10 +289,8 @@ class Tables(Benchmark):
                 found += [beside | row for row in rows]
                 yield {"rows": sorted(found, key=_place)}
 
-    def report(self, results: dict[str, Any]) -> None:
-        page = self.docs / "rivals.md"
-        if page.exists():
-            write_table(page, MARK, table_of(results["rows"]))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "rivals.md", MARK, table_of(results["rows"])
 
 
 def _place(row: dict[str, Any]) -> tuple[int, int]:

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
+from benchmark import RESULTS, Benchmark, data_folder, number, table
 
 import jaxslam
 from jaxslam.consistency import run_through
@@ -77,18 +77,19 @@ class RecordedLoops(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one trajectory at a time."""
-        results = self.found()
-        asked = {"runs": self.runs, "seed": self.seed}
-        for name in self.trajectories:
-            scenario = whole(name, self.steps)
-            told = {**asked, "steps": scenario.steps}
-            if any(results.get(name, {}).get(field) != value for field, value in told.items()):
-                rows = list(of_scenario(self, scenario))
-                results[name] = {**told, "each": rows}
-                yield results
+        worlds = {name: whole(name, self.steps) for name in self.trajectories}
+        of = {"runs": self.runs, "seed": self.seed}
+        yield from self.added(
+            (
+                (name,),
+                of | {"steps": scenario.steps},
+                lambda scenario=scenario: {"each": list(of_scenario(self, scenario))},
+            )
+            for name, scenario in worlds.items()
+        )
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "submaps.md", MARK, page(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "submaps.md", MARK, page(results)
 
 
 def page(results: dict[str, Any]) -> str:

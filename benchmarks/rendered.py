@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmark import RESULTS, Benchmark, number, table
 from rendered_videos import KINDS, rendered_source
 from scipy.stats import chi2
 from sequences import evaluated
-from starts import LIE
+from stress import LIE
 
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.video import track
@@ -55,8 +55,8 @@ class Rendered(Benchmark):
                 print(name, seed, done, flush=True)
                 yield results
 
-    def report(self, results: Results) -> None:
-        write_table(self.docs / "sequences.md", MARK, as_table(results))
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
+        yield "sequences.md", MARK, as_table(results)
 
 
 def measure(source) -> dict[str, Any]:

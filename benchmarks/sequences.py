@@ -23,7 +23,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
+from benchmark import RESULTS, Benchmark, data_folder, number, table
 
 from jaxslam.evaluation import Evaluation, evaluate_log
 from jaxslam.io.tum import write_tum
@@ -87,10 +87,10 @@ class Sequences(Benchmark):
                 print(source.name, key, done[key], flush=True)
                 yield results
 
-    def report(self, results: Results) -> None:
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
         for mark, part in PARTS.items():
-            write_table(self.docs / "sequences.md", mark, part(results))
-        write_table(self.docs / "results.md", MARK, words(results))
+            yield "sequences.md", mark, part(results)
+        yield "results.md", MARK, words(results)
 
 
 def measure(source, settings: TrackerSettings) -> dict[str, Any]:

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmark import RESULTS, Benchmark, number, table
 from submaps_batch import batch_positions
 
 import jaxslam
@@ -65,17 +65,14 @@ class Submaps(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one scenario at a time."""
-        results = self.found()
-        for name in self.scenarios:
-            told = {"runs": self.runs, "seed": self.seed, "wrong": self.wrong, "steps": self.steps}
-            key = f"{name}, {100 * self.wrong:.0f} % wrong"
-            if any(results.get(key, {}).get(field) != value for field, value in told.items()):
-                results[key] = {**told, **measured(self, name)}
-                print(results[key], flush=True)
-                yield results
+        of = {"runs": self.runs, "seed": self.seed, "wrong": self.wrong, "steps": self.steps}
+        yield from self.added(
+            ((f"{name}, {100 * self.wrong:.0f} % wrong",), of, partial(measured, self, name))
+            for name in self.scenarios
+        )
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "submaps.md", MARK, page(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "submaps.md", MARK, page(results)
 
 
 def page(results: dict[str, Any]) -> str:

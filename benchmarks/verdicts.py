@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, run_one, table
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
@@ -79,8 +79,8 @@ class Verdicts(Benchmark):
             "heavy": heavy(self, rng),
         }
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "consistency.md", BEGIN, as_table(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "consistency.md", BEGIN, as_table(results)
 
 
 def series(

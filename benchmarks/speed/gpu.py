@@ -30,7 +30,7 @@ import jax
 import numpy as np
 
 import jaxslam
-from benchmarks.benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmarks.benchmark import RESULTS, Benchmark, number, table
 from benchmarks.speed.__main__ import difference
 from benchmarks.speed.workload import (
     WORKLOADS,
@@ -319,8 +319,8 @@ class OnGpu(Benchmark):
             seconds.append(time.perf_counter() - began)
         return float(np.median(seconds))
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "speed.md", BEGIN, shown(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "speed.md", BEGIN, shown(results)
 
 
 class Clock:
