@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from functools import cache
-from pathlib import Path
 
 import jax
 import pytest
@@ -103,13 +102,6 @@ def test_studies_and_products_of_single_precision_are_measured_too(small):
     assert found["recommended"]["relative"] > 0
     assert found["float32_beside_float64"]["whole_products"]["nees_of_no_covariance"] == 0
     assert "on the device, chunks of 4 | 6 |" in shown(found)
-
-
-def test_the_page_has_the_numbers_on_disk():
-    folder = Path(__file__).resolve().parents[2]
-    results = json.loads((folder / "benchmarks/results/gpu.json").read_text())
-    table = f"{BEGIN}\n\n{shown(results)}\n\n{END}"
-    assert table in (folder / "docs/speed.md").read_text()
 
 
 def test_without_a_gpu_one_line_says_so(monkeypatch, capsys):
