@@ -23,8 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, studied, table
-from modes import modes_of_run
-from modes_figure import plot_modes, worlds_of
+from modes import modes_of_run, plot_modes, worlds_of
 
 import jaxslam
 from jaxslam.consistency import draw, filter_run

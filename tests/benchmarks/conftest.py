@@ -3,6 +3,6 @@
 from jaxtyping import install_import_hook
 
 install_import_hook(
-    ["modes", "modes_figure", "tracks"],
+    ["modes", "tracks"],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )

