@@ -62,7 +62,7 @@ def test_the_estimate_of_the_intrinsics_is_judged_by_its_covariance():
     ("fields", "message"),
     [
         ({"truths": ("wrong",)}, r"truths must be some of nominal, white, constant, not \('wrong'"),
-        ({"runs": 0}, "runs must be at least 1, not 0"),
+        ({"treatments": ()}, "treatments must be some of white, consider, estimated, known"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(fields, message):
