@@ -78,7 +78,8 @@ class CalibrationStudy(Benchmark):
                 truth: draw(world, self.runs, seed=self.seed) for truth, world in worlds.items()
             }
             # One room for all truths, so that a filter compiles once.
-            room = Room(*(max(counts) for counts in zip(*(room for room, _ in drawn.values()))))
+            rooms = (room for room, _ in drawn.values())
+            room = Room(*np.max([*rooms], axis=0).tolist())
             results[name] = {}
             for truth, scenario in worlds.items():
                 rows = results[name].setdefault(truth, {})
