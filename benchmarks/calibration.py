@@ -183,10 +183,7 @@ def page(summary: dict[str, Any]) -> str:
         parts += [f"## `{name}`", _rows(by_truth)]
         estimates = _estimates(by_truth)
         if estimates:
-            parts += [
-                "The final intrinsics of `estimated` (initial σ 3 and 2 px):",
-                estimates,
-            ]
+            parts += ["The final intrinsics of `estimated` (initial σ 3 and 2 px):", estimates]
     parts.append(
         f"Measured by `python benchmarks/calibration.py --runs {summary['runs']}`, which writes "
         f"this page: {summary['runs']} runs of {summary['steps']} steps, seed {summary['seed']}."

@@ -104,8 +104,7 @@ def test_a_page_without_a_place_and_a_broken_file_are_refused(folder):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
-    [(None, "–"), (float("nan"), "–"), (3.14159, "3.14"), (-12345.0, "-1.2e+04")],
+    ("value", "said"), [(None, "–"), (float("nan"), "–"), (3.14159, "3.14"), (-12345.0, "-1.2e+04")]
 )
 def test_numbers_of_a_table_are_short(value, said):
     assert number(value) == said

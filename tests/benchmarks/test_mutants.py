@@ -39,10 +39,7 @@ def test_they_are_drawn_of_every_room_by_a_seed():
 
 @pytest.mark.parametrize(
     ("body", "told"),
-    [
-        pytest.param("assert x > 0", "survived", marks=pytest.mark.slow),
-        ("assert x == 3", "FAILED"),
-    ],
+    [pytest.param("assert x > 0", "survived", marks=pytest.mark.slow), ("assert x == 3", "FAILED")],
 )
 def test_a_mutant_is_caught_by_a_test_that_fails(tmp_path, body, told):
     path = tmp_path / "jaxslam" / "linalg.py"
