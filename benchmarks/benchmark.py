@@ -56,7 +56,7 @@ class Benchmark(ABC):
         """Yield the results so far, all of them, after every part."""
 
     def tables(self, results: Any) -> Iterator[tuple[str, str, str]]:
-        """A page, a mark on it and what is written behind that; without a mark, the whole page."""
+        """A page, a mark on it, and what is written behind that."""
         del results
         yield from ()
 
@@ -65,8 +65,7 @@ class Benchmark(ABC):
         written = False
         for page, mark, text in self.tables(results):
             written = True
-            path = self.docs / page
-            write_table(path, mark, text) if mark else write_page(path, text)
+            write_table(self.docs / page, mark, text)
         if not written:
             print(json.dumps(results, indent=1, ensure_ascii=False), flush=True)
 

@@ -18,6 +18,8 @@ from benchmark import RESULTS, Benchmark, at_end, number, studied, table
 
 import jaxslam
 
+NUMBERS, PARAMETRIZATIONS = "<!-- comparison.py -->", "<!-- all parametrizations -->"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison(Benchmark):
@@ -63,39 +65,8 @@ class Comparison(Benchmark):
         }
 
     def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-        yield "comparison.md", "", page(results)
-
-
-def page(summary: dict[str, Any]) -> str:
-    """The Markdown page."""
-    results, runs = summary["scenarios"], summary["runs"]
-    bands = {one["band95"][0]: one["band95"] for f in results.values() for one in f.values()}
-    low, high = bands[max(bands)]
-    counts = {one["runs"] for filters in results.values() for one in filters.values()}
-    few = ", ".join(str(n) for n in sorted(counts - {runs}))
-    parts = [
-        ANSWER,
-        "Mean NEES at the last step, whose ideal value is 3; the share of runs lost there (NEES "
-        "above the 99.99 % quantile of χ²); σ over the RMSE of the position, ideally 1. "
-        f"The 95 % band of the mean NEES of {runs} runs is {low:.2f}–{high:.2f}.",
-        _table(results, runs),
-        f"†: fewer runs, {few or 'none'} instead of {runs}.",
-        "## The parametrizations",
-        _parametrizations(),
-        f"`python benchmarks/comparison.py` writes this page, with seed {summary['seed']} for all "
-        "filters. RMSE, medians, the share of steps inside the band and times are in "
-        "`benchmarks/results/comparison.json`.",
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-ANSWER = """# Which landmark parametrization is the most consistent?
-
-Inverse Scaling, held in the camera frame, and the homogeneous point without an anchor, which gives
-the same numbers. In all four scenarios their mean NEES is the smallest, or within 1 % of it.
-Unified Inverse Depth (`inverse_depth`) is more over-confident in each, and Cartesian points lose
-most runs outside of `circle`. In a world frame Inverse Scaling is far worse, while anchored
-parametrizations hardly change."""
+        yield "comparison.md", NUMBERS, as_table(results["scenarios"], results["runs"])
+        yield "comparison.md", PARAMETRIZATIONS, parametrizations()
 
 
 def _cell(found: dict[str, Any] | None, runs: int) -> str:
@@ -107,7 +78,7 @@ def _cell(found: dict[str, Any] | None, runs: int) -> str:
     return f"{number(found['nees'])}; {found['lost']:.0%}{diverged}; {ratio}{few}"
 
 
-def _parametrizations() -> str:
+def parametrizations() -> str:
     """All of them, as a Markdown table."""
     header = "name", "parameters", "numbers, spatial (planar)", "point", "source"
     all_of_them = jaxslam.LANDMARKS.values()
@@ -120,13 +91,15 @@ def _parametrizations() -> str:
     )
 
 
-def _table(results: dict[str, dict[str, Any]], runs: int) -> str:
-    """A row for each filter, a column for each scenario."""
-    rows = []
+def as_table(results: dict[str, dict[str, Any]], runs: int) -> str:
+    """A row for each filter, a column for each scenario; fewer runs are marked."""
+    rows, counts = [], {one["runs"] for filters in results.values() for one in filters.values()}
     for name in dict.fromkeys(name for filters in results.values() for name in filters):
         cells = (_cell(filters.get(name), runs) for filters in results.values())
         rows.append([name.replace("/", " "), *cells])
-    return table(["frame, landmark", *(f"`{name}`" for name in results)], rows)
+    few = ", ".join(str(n) for n in sorted(counts - {runs})) or "none"
+    told = table(["frame, landmark", *(f"`{name}`" for name in results)], rows)
+    return f"{told}\n\n†: fewer runs, {few} instead of {runs}."
 
 
 if __name__ == "__main__":

@@ -19,9 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import END, RESULTS, Benchmark, at_end, studied, table
-from verdicts import BEGIN
-from verdicts import as_table as table_of_verdicts
+from benchmark import RESULTS, Benchmark, at_end, studied, table
 
 import jaxslam
 from jaxslam._runtime.files import json_numbers, write_atomically
@@ -32,8 +30,7 @@ Row = dict[str, Any]
 Results = dict[str, dict[str, Row]]
 """`results[scenario][filter/landmarks]`: what `measure` returns of one seed, `together` of more."""
 TALLIES = ("tally", "one_scale", "drift")
-VERDICTS = RESULTS / "verdicts.json"
-MARK = "<!-- consistency.py -->"
+MARK, SAID = "<!-- consistency.py -->", "<!-- consistency.py, in words -->"
 IN_README = ("matched", "matched-loose", "matched-forward-loose")
 STEPS = (5, 10)
 """Steps whose mean NEES the page shows, beside the last."""
@@ -78,7 +75,8 @@ class Consistency(Benchmark):
         """`add_to` has done it, as other commands add to the file too."""
 
     def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
-        yield "consistency.md", "", page(results)
+        yield "consistency.md", SAID, in_words(results)
+        yield "consistency.md", MARK, as_table(results)
         if self.page:
             yield "../README.md", MARK, recommended(results, IN_README)
             yield "results.md", MARK, beside(results)
@@ -152,55 +150,23 @@ def verdicts_of(row: Row) -> dict[str, dict[str, Any]]:
     return {key: Tally.from_dict(row[key]).verdict() for key in TALLIES if key in row}
 
 
-def page(results: Results, verdicts: Path = VERDICTS) -> str:
-    """The Markdown page, with the table of `verdicts.py` where that was run."""
-    rows = [row for filters in results.values() for row in filters.values()]
-    seeds = f"seeds {named({s for row in rows for s in row['seeds']})}" if rows else "its seeds"
-    counts = sorted({row["runs"] for row in rows}) or [0]
-    lines = [
-        "# Which filter is consistent in which scenario?",
-        "",
-        *in_words(results),
-        "",
-        "All filters use Inverse Scaling. `recommended` is",
-        "`scale_gauge+oc+scene50+walk3+mixture17`, in space `mixture9`; a name that begins with",
-        "`+` continues `scale_gauge`. What the filters do is on [another page](repairs.md).",
-        "Written by `python benchmarks/consistency.py`; a row",
-        f"is one study of {counts[0]} to {counts[-1]} runs of {seeds}.",
-        "",
-        "- *NEES* is of the camera pose; a consistent filter has 3 on average, 6 in space.",
-        "- *σ should be ×*: √(NEES/ideal) over all steps, with its 99 % interval.",
-        "- *Verdict*: of all steps, the last step and each third of the runs together; in brackets",
-        "  the part that decided.",
-        "- *At one scale; drift*: the verdict on NEES at the scale of each run that explains its",
-        "  poses best, and on the drift of scale, of which only over-confidence can be proven",
-        "  ([units of length](gauge.md)). *Yes* is consistent, *over* and *under* are",
-        "  over-confident and under-confident, *?* cannot be decided.",
-        "- *NEES at steps*: the mean over all runs, bold inside its exact 95 % band.",
-        "- *Lost*: the share of runs above the 99.99 % quantile of χ² at the last step; *ever*:",
-        "  above a stricter limit, for so many steps, at any step.",
-        "- *RMSE; σ* are those of the position at the last step. –: a run diverged, so there is no",
-        "  mean. Medians and means without lost runs are in `benchmarks/results/consistency.json`.",
-    ]
-    if any("drift" not in row for row in rows):
-        lines += [
-            "- †: measured before verdicts looked at thirds and at drift: the verdict is of all",
-            "  steps and the last one, and *ever* uses the quantile of a single step.",
-        ]
+def as_table(results: Results) -> str:
+    """All rows, by scenario."""
     steps = ", ".join(map(str, STEPS))
     header = [
         "scenario, filter", "NEES, all steps", "σ should be ×", "verdict", "at one scale; drift",
         f"NEES at steps {steps}, last", "lost; ever", "RMSE; σ, m",
     ]  # fmt: skip
-    cells: list[list[str]] = []
+    rows: list[list[str]] = []
     for name, filters in results.items():
-        cells.append([f"**`{name}`**", *[""] * (len(header) - 1)])
-        cells += [_row(key, row) for key, row in filters.items()]
-    return "\n".join([*lines, "", table(header, cells), *_of_verdicts(verdicts)]) + "\n"
+        rows.append([f"**`{name}`**", *[""] * (len(header) - 1)])
+        rows += [_row(key, row) for key, row in filters.items()]
+    return table(header, rows)
 
 
-def in_words(results: Results) -> list[str]:
-    """In how many scenarios each filter is consistent, and by how much σ is wrong elsewhere."""
+def in_words(results: Results) -> str:
+    """In how many scenarios each filter is consistent, by how much σ is wrong elsewhere, and of how
+    many runs that is."""
     lines = []
     for name in ("robocentric", "scale_gauge", "recommended"):
         found = [
@@ -215,7 +181,10 @@ def in_words(results: Results) -> list[str]:
                 f"- `{name}` is consistent in {right} of {len(found)} scenarios. Over all steps "
                 f"its σ should be multiplied by {min(factors):.3g} to {max(factors):.3g}."
             )
-    return lines
+    rows = [row for filters in results.values() for row in filters.values()]
+    runs, seeds = [row["runs"] for row in rows], {seed for row in rows for seed in row["seeds"]}
+    told = f"A row is one study of {min(runs)} to {max(runs)} runs of seeds {named(seeds)}."
+    return "\n".join([*lines, "", told])
 
 
 def label(name: str) -> str:
@@ -226,34 +195,6 @@ def label(name: str) -> str:
     if "+scene50" in slam:
         return "recommended"
     return slam.replace("scale_gauge+", "+")
-
-
-def _of_verdicts(path: Path) -> list[str]:
-    """How often a verdict is wrong."""
-    if not path.exists():
-        return []
-    return [
-        "",
-        "## How often a verdict is wrong",
-        "",
-        "Fewer than 1.1 % of the studies of a consistent filter are called inconsistent, and",
-        "hardly any filter whose σ is wrong by 1.3 is called consistent. A σ that is wrong by 1.3",
-        "is found surely with 300 runs, and one that is wrong by 2 with 100.",
-        "",
-        "`python benchmarks/verdicts.py verdicts` draws NEES as a filter would have it: with 1,",
-        "2, 3 and 6 degrees of freedom, of one step, and of 12 steps that are independent or",
-        "correlated by 0.98. For each number of runs the table has the worst of all these, or",
-        "their range. In the column of opposite faults NEES/dof grows from 0.7 at the start to",
-        "1.3 at the end. The last column is the share of intervals of σ that hold the truth where",
-        "1 % of the runs have twenty times the variance. The interval allows for three runs that",
-        "are just lost, in case a study has none of those.",
-        "",
-        BEGIN,
-        "",
-        table_of_verdicts(json.loads(path.read_text())),
-        "",
-        END,
-    ]
 
 
 BRIEF = {"consistent": "yes", "over-confident": "over", "under-confident": "under"}
