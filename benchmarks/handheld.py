@@ -170,8 +170,7 @@ def numbers(records: dict[str, np.ndarray]) -> dict[str, Any]:
     one = one_scale_of(records)
     whole = {**records, "nees": one.nees, "drift": one.drift, "normalised": one.normalised}
     part = {key: np.asarray(values)[:, np.array(at) - 1] for key, values in whole.items()}
-    nees, error, sigma = (part[key] for key in ("nees", "log_scale", "log_scale_sigma"))
-    finite, own = np.isfinite(nees), part["beyond_scale"]
+    nees, finite = part["nees"], np.isfinite(part["nees"])
 
     def mean(values: np.ndarray) -> list[float | None]:
         counted = finite & np.isfinite(values)
@@ -184,30 +183,19 @@ def numbers(records: dict[str, np.ndarray]) -> dict[str, Any]:
 
     with np.errstate(invalid="ignore"):
         lost = ~(nees <= lost_threshold(DOF))
-        normalised = (error / sigma) ** 2
+        normalised = (part["log_scale"] / part["log_scale_sigma"]) ** 2
         nis = np.nansum(records["nis"]) / np.nansum(records["nis_dof"])
     return {
         "at": at,
         "one_scale": mean(nees / DOF),
         "one_scale_median": _for_json(np.median(np.where(finite, nees, np.inf), axis=0) / DOF),
-        "own_scale_median": _for_json(np.median(np.where(finite, own, np.inf), axis=0) / (DOF - 1)),
         "drift_rms": root(part["drift"] ** 2),
         "drift_normalised": root(part["normalised"]),
-        "drift_normalised_median": _middle(np.sqrt(part["normalised"])),
         "lost": lost.mean(axis=0).tolist(),
-        "log_scale_rms": root(error**2),
-        "log_scale_median": _for_json(np.median(np.where(finite, np.abs(error), np.inf), axis=0)),
-        "log_scale_sigma": _for_json(np.median(np.where(finite, sigma, np.inf), axis=0)),
         "log_scale_normalised": root(normalised),
         "reversed": mean(part["reversed"]),
         "nis": _for_json(np.array([nis]))[0],
     }
-
-
-def _middle(values: np.ndarray) -> list[float | None]:
-    """Medians of what is there."""
-    columns = [column[np.isfinite(column)] for column in values.T]
-    return [float(np.median(column)) if column.size else None for column in columns]
 
 
 def _for_json(values: np.ndarray) -> list[float | None]:
