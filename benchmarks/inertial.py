@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, by_batch, number, table
+from benchmark import RESULTS, Benchmark, by_batch
 
 import jaxslam
 from jaxslam.consistency import draw, run_through
@@ -28,8 +28,6 @@ from jaxslam.statistics.bands import chi2_quantile, normalised_squared
 RECIPE = {"depth_range": [5.0, 7.0], "inverse_depth": [0.1682, 0.0164], "landmarks": 30}
 """With the mean and σ of 1/z of points that are uniform between 5 and 7 m."""
 PARTS = {"orientation": slice(3, 6), "position": slice(0, 3)}
-TOLD = "first", "last", "end"
-"""Spans of a run: two thirds, and the last second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,21 +77,6 @@ class Inertial(Benchmark):
             found[part]["rmse"] = float(np.sqrt(np.mean(errors[:, -1, index])))
         lost = np.any(nees[:, -1] > chi2_quantile(0.9999, 3), axis=1)
         return found | {"lost": float(np.mean(lost))}
-
-    def report(self, results: dict[str, Any]) -> None:
-        for trajectory, filters in results.items():
-            rows = [[name, *_cells(row)] for name, row in filters.items()]
-            header = [f"{part}, {of}" for part in PARTS for of in (*TOLD, "rms")]
-            print(trajectory, table(["filter", *header, "lost"], rows), sep="\n", flush=True)
-
-
-def _cells(row: dict[str, Any]) -> Iterator[str]:
-    for part in PARTS:
-        for of in TOLD:
-            mean, low, high = map(number, row[part][of])
-            yield f"{mean} [{low}, {high}]"
-        yield number(row[part]["rmse"], ".4f")
-    yield f"{100 * row['lost']:.1f} %"
 
 
 def _interval95(by_run: np.ndarray) -> list[float]:

@@ -74,10 +74,6 @@ class LongRuns(Benchmark):
         return {"at": at, **kept, "microseconds_per_step": 1e6 * seconds / self.runs / self.steps}
 
     def report(self, results: dict[str, Any]) -> None:
-        for scenario, filters in results.items():
-            for name, row in filters.items():
-                told = [row[key][-1] for key in ("nees", "nees_median", "lost")]
-                print(scenario, name, *told, flush=True)
         save(drawn_of(results), self.docs / "long-runs.png")
 
 

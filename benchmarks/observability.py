@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, at_end, number, studied, table
+from benchmark import RESULTS, Benchmark, at_end, studied
 
 import jaxslam
 from jaxslam.consistency import Study
@@ -23,7 +23,7 @@ from jaxslam.consistency import Study
 
 @dataclass(frozen=True, kw_only=True)
 class Observability(Benchmark):
-    """Every filter in every scenario; `--page` prints the table of what is there."""
+    """Every filter in every scenario."""
 
     filters: tuple[str, ...] = (
         "robocentric/inverse_scaling", "robocentric+oc/inverse_scaling",
@@ -55,9 +55,6 @@ class Observability(Benchmark):
         seconds = round(found["seconds"]["run"] / self.runs, 4)
         return at_end(found) | {"along": _along(study, name), "seconds_per_run": seconds}
 
-    def report(self, results: dict[str, Any]) -> None:
-        print(as_table(results["scenarios"]), flush=True)
-
 
 def _along(study: Study, name: str) -> dict[str, float]:
     """Median over the runs of the last step's |error| and σ along the nominal direction of
@@ -72,28 +69,6 @@ def _along(study: Study, name: str) -> dict[str, float]:
         "error": round(float(np.nanmedian(np.abs(error))), 4),
         "sigma": round(float(np.nanmedian(np.sqrt(variance))), 4),
     }
-
-
-def as_table(rows: dict[str, dict[str, Any]]) -> str:
-    """All scenarios as one Markdown table."""
-    header = (
-        "scenario", "filter", "NEES mean / median", "lost", "inside", "RMSE / σ, m",
-        "along the path: median error / σ, m",
-    )  # fmt: skip
-    lines = [
-        (
-            f"`{scenario}`" if i == 0 else "",
-            name,
-            f"{number(f['nees'])} / {number(f['nees_median'])}",
-            f"{f['lost']:.1%}",
-            f"{f['inside']:.0%}",
-            f"{number(f['rmse'], '.3f')} / {number(f['sigma'], '.3f')}",
-            f"{f['along']['error']:.3f} / {f['along']['sigma']:.3f}",
-        )
-        for scenario, filters in rows.items()
-        for i, (name, f) in enumerate(filters.items())
-    ]
-    return table(header, lines)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from benchmark import RESULTS, Benchmark, run_one, table
+from benchmark import RESULTS, Benchmark, table
 from scipy.signal import lfilter
 
 from jaxslam.statistics import run_verdict
@@ -274,4 +274,4 @@ def largest(rows: list[dict[str, Any]], test: str) -> float:
 
 
 if __name__ == "__main__":
-    run_one(OneRunStudy)
+    OneRunStudy.run()

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, data_folder, number, run_one, table
+from benchmark import RESULTS, Benchmark, data_folder, number, table
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -287,4 +287,4 @@ def as_table(logs: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    run_one(RealLogs)
+    RealLogs.run()

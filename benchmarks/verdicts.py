@@ -11,7 +11,6 @@ Each writes a JSON file of its name; `verdicts` the table in `docs/consistency.m
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -274,10 +273,6 @@ class Conventions(Benchmark):
                 sets = max(self.sets * STUDIES[0] // runs, 1)
                 result["wrong_sigma"].append(blamed(position, rotation, runs, sets))
                 yield result
-
-    def report(self, results: dict[str, Any]) -> None:
-        *_, last = results["wrong_sigma"]
-        print(json.dumps({**results, "wrong_sigma": last}), flush=True)
 
 
 def constructed(number: int, runs: int) -> Case:
