@@ -110,22 +110,34 @@ class Benchmark(ABC):
         run_one(cls)
 
 
+@dataclass(frozen=True, kw_only=True)
+class OfRuns(Benchmark):
+    """A benchmark of simulated runs."""
+
+    runs: int = 200
+    """Runs of every filter in every world."""
+    seed: int = 0
+    """Run i draws from this seed and i alone."""
+    chunk: int = 25
+    """Runs in one batch."""
+
+    def study(
+        self, scenario: jaxslam.Scenario, name: str, seed: int | None = None
+    ) -> tuple[jaxslam.consistency.Study, dict[str, Any]]:
+        """A study of one filter, `name` or `name/landmarks`, and its summary."""
+        frame, _, landmarks = name.partition("/")
+        filters = jaxslam.make_filters(scenario, [frame], [landmarks or "inverse_scaling"])
+        seed = self.seed if seed is None else seed
+        study = jaxslam.monte_carlo(scenario, filters, runs=self.runs, seed=seed, chunk=self.chunk)
+        (found,) = jaxslam.summarise(study)["filters"].values()
+        return study, found
+
+
 def run_one(*benchmarks: type[Benchmark]) -> None:
     """The command line of a file of several benchmarks: the name of one, and its options."""
     first, *_ = benchmarks
     jax.config.update("jax_enable_x64", first.double)
     tyro.cli(Union[benchmarks], description=sys.modules[first.__module__].__doc__)()  # noqa: UP007  # ty: ignore[invalid-type-form]
-
-
-def studied(
-    scenario: jaxslam.Scenario, name: str, **sizes: Any
-) -> tuple[jaxslam.consistency.Study, dict[str, Any]]:
-    """A study of one filter, `name` or `name/landmarks`, and its summary."""
-    frame, _, landmarks = name.partition("/")
-    filters = jaxslam.make_filters(scenario, [frame], [landmarks or "inverse_scaling"])
-    study = jaxslam.monte_carlo(scenario, filters, **sizes)
-    (found,) = jaxslam.summarise(study)["filters"].values()
-    return study, found
 
 
 def at_end(found: dict[str, Any]) -> dict[str, Any]:

@@ -19,10 +19,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, at_end, by_batch, number, table
+from benchmark import RESULTS, OfRuns, at_end, by_batch, number, table
 
 import jaxslam
-from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, draw, filter_run
+from jaxslam.consistency import MemoryStore, Seconds, Study, draw, filter_run
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.sensors import Pinhole
@@ -40,7 +40,7 @@ TRUTH = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationStudy(Benchmark):
+class CalibrationStudy(OfRuns):
     """Treatments under truths in worlds."""
 
     scenarios: tuple[str, ...] = ("circle", "matched")
@@ -52,7 +52,7 @@ class CalibrationStudy(Benchmark):
     filters: tuple[str, ...] = ("robocentric",)
     landmarks: tuple[str, ...] = ("inverse_scaling",)
     runs: int = 400
-    seed: int = 0
+    chunk: int = 100
     steps: int = 60
     out: Path = RESULTS / "calibration.json"
 
@@ -99,7 +99,7 @@ class CalibrationStudy(Benchmark):
         """Numbers of the last step; of intrinsics where they are estimated."""
         sensor, store, every = scenario.sensor, MemoryStore(), range(self.runs)
         assert isinstance(sensor, Pinhole)
-        records, last = by_batch(partial(_batch, slam, room, sensor), runs, CHUNK)
+        records, last = by_batch(partial(_batch, slam, room, sensor), runs, self.chunk)
         store.save("slam", every, records)
         study = Study(
             scenario, {"slam": slam}, self.runs, self.seed, "float64", (every,), store,

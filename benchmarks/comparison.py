@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from benchmark import RESULTS, Benchmark, at_end, number, studied, table
+from benchmark import RESULTS, OfRuns, at_end, number, table
 
 import jaxslam
 
@@ -22,7 +22,7 @@ NUMBERS, PARAMETRIZATIONS = "<!-- comparison.py -->", "<!-- all parametrizations
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(Benchmark):
+class Comparison(OfRuns):
     """Parametrizations in frames in worlds."""
 
     scenarios: tuple[str, ...] = ("matched", "matched-loose", "matched-forward", "circle")
@@ -32,8 +32,7 @@ class Comparison(Benchmark):
     landmarks: tuple[str, ...] = tuple(jaxslam.LANDMARKS)
     """Landmark parametrizations; all by default."""
     runs: int = 1000
-    """Runs of every filter."""
-    seed: int = 0
+    chunk: int = 100
     out: Path = RESULTS / "comparison.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
@@ -55,7 +54,7 @@ class Comparison(Benchmark):
 
     def _measured(self, name: str, slam: str) -> dict[str, Any]:
         scenario = jaxslam.scenario(name)
-        _, found = studied(scenario, slam, runs=self.runs, seed=self.seed)
+        _, found = self.study(scenario, slam)
         row = at_end(found)
         rmse, sigma = row["rmse"], row.pop("sigma")
         microseconds = 1e6 * found["seconds"]["run"] / self.runs / scenario.steps

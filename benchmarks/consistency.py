@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, at_end, studied, table
+from benchmark import RESULTS, OfRuns, at_end, table
 
 import jaxslam
 from jaxslam._runtime.files import json_numbers, write_atomically
@@ -37,7 +37,7 @@ STEPS = (5, 10)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Consistency(Benchmark):
+class Consistency(OfRuns):
     """Filters in scenarios on seeds."""
 
     scenarios: tuple[str, ...] = (
@@ -53,11 +53,8 @@ class Consistency(Benchmark):
     landmarks: tuple[str, ...] = ("inverse_scaling",)
     """Landmark parametrizations."""
     runs: int = 1000
-    """Runs of every seed."""
     seeds: tuple[int, ...] = tuple(range(20))
     """Seeds. What is measured already is not measured again."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "consistency.json"
 
     def measure(self) -> Iterator[Results]:
@@ -84,7 +81,7 @@ class Consistency(Benchmark):
 
 def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Consistency) -> Row:
     """One filter on one seed: numbers from which those of many seeds follow."""
-    study, f = studied(scenario, name, runs=options.runs, seed=seed, chunk=options.chunk)
+    study, f = options.study(scenario, name, seed)
     (key,) = study.filters
     nis = np.sum(np.array(f["nis"], float)) / np.sum(np.array(f["nis_dof"], float))
     last = at_end(f)

@@ -22,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, studied, table
+from benchmark import RESULTS, OfRuns, table
 from modes import modes_of_run, plot_modes, worlds_of
 
 import jaxslam
@@ -48,15 +48,11 @@ SETTLED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromRest(Benchmark):
+class FromRest(OfRuns):
     """Filters that are not told how the camera sets out."""
 
     scenarios: tuple[str, ...] = ("standstill", "standstill-6dof")
-    """Scenarios."""
     filters: tuple[str, ...] = ("robocentric", "scale_gauge+mixture9")
-    """Filters."""
-    runs: int = 200
-    """Runs."""
     seed: int = 101
     """One that nothing was chosen by."""
     chunk: int = 1
@@ -76,8 +72,7 @@ class FromRest(Benchmark):
         )
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
-        sizes = {"runs": self.runs, "seed": self.seed, "chunk": self.chunk}
-        _, found = studied(jaxslam.scenario(scenario), name, **sizes)
+        _, found = self.study(jaxslam.scenario(scenario), name)
         return {
             **{key: found[key] for key in KEYS},
             "milliseconds_per_run": 1e3 * found["seconds"]["run"] / self.runs,

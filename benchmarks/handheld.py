@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import tracks
-from benchmark import RESULTS, Benchmark, Case, data_folder, table
+from benchmark import RESULTS, Case, OfRuns, data_folder, table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
@@ -53,7 +53,7 @@ RECORDS = ("log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Handheld(Benchmark):
+class Handheld(OfRuns):
     """Filters along trajectories and drives."""
 
     filters: tuple[str, ...] = ("world", "robocentric", "scale_gauge+scene50+mixture9")
@@ -64,18 +64,12 @@ class Handheld(Benchmark):
     """Names of trajectories; all of the data folder by default."""
     drives: tuple[str, ...] = ()
     """Names of drives with tracks; all of the data folder by default."""
-    runs: int = 200
-    """Simulated runs along every trajectory."""
     steps: int = 150
     """Of a simulated run."""
     starts: int = 20
     """Windows of every drive."""
     frames: int = 100
     """Steps of a window of a drive."""
-    seed: int = 0
-    """Of the simulated runs."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "handheld.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:

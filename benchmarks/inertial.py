@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, by_batch
+from benchmark import RESULTS, OfRuns, by_batch
 
 import jaxslam
 from jaxslam.consistency import draw, run_through
@@ -31,7 +31,7 @@ PARTS = {"orientation": slice(3, 6), "position": slice(0, 3)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inertial(Benchmark):
+class Inertial(OfRuns):
     """Filters along recorded trajectories."""
 
     trajectories: tuple[str, ...] = ("udel_gore", "tum_corridor1")
@@ -41,13 +41,9 @@ class Inertial(Benchmark):
     )  # fmt: skip
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 100
-    """Runs of each."""
     steps: int = 1600
     """Frames of every run."""
     seed: int = 20261128
-    """Seed of the runs."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "inertial.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:

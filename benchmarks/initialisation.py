@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, by_batch
+from benchmark import RESULTS, OfRuns, by_batch
 from jaxtyping import Array, Bool
 
 import jaxslam
@@ -35,7 +35,7 @@ NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Initialisation(Benchmark):
+class Initialisation(OfRuns):
     """Undelayed and delayed filters in the same worlds."""
 
     scenarios: tuple[str, ...] = ("near", "matched", "circle")
@@ -50,14 +50,9 @@ class Initialisation(Benchmark):
         "robocentric+rays/cartesian",
     )
     """Filters with their landmarks."""
-    runs: int = 200
-    """Runs of every filter."""
-    seed: int = 0
-    """Run i draws from this seed and i alone."""
     steps: int | None = None
     """Filter steps; the scenario's by default."""
     chunk: int = 50
-    """Runs in one batch."""
     out: Path = RESULTS / "initialisation.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, studied
+from benchmark import RESULTS, OfRuns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -39,21 +39,17 @@ IDEAL = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class LongRuns(Benchmark):
+class LongRuns(OfRuns):
     """Filters in long runs."""
 
     scenarios: tuple[str, ...] = tuple(WORLDS)
-    """Scenarios."""
     filters: tuple[str, ...] = ("robocentric", "world+oc", "scale_gauge+oc+scene50", "recommended")
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 48
-    """Runs of each."""
     steps: int = 3000
     """Steps of every run."""
     seed: int = 20261128
-    """Seed of the runs."""
     chunk: int = 24
-    """Runs in one batch."""
     out: Path = RESULTS / "long_runs.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
@@ -67,7 +63,7 @@ class LongRuns(Benchmark):
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario(scenario, {"steps": self.steps})
-        _, found = studied(world, name, runs=self.runs, seed=self.seed, chunk=self.chunk)
+        _, found = self.study(world, name)
         at = np.unique(np.geomspace(FIRST, self.steps, MOST).round().astype(int)).tolist()
         kept = {key: [found[key][k - 1] for k in at] for key in ("nees", "nees_median", "lost")}
         seconds = found["seconds"]["run"]

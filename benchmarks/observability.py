@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, at_end, studied
+from benchmark import RESULTS, OfRuns, at_end
 
 import jaxslam
 from jaxslam.consistency import Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observability(Benchmark):
+class Observability(OfRuns):
     """Every filter in every scenario."""
 
     filters: tuple[str, ...] = (
@@ -36,9 +36,7 @@ class Observability(Benchmark):
     scenarios: tuple[str, ...] = (
         "matched", "matched-loose", "matched-forward", "matched-forward-loose", "circle",
     )  # fmt: skip
-    runs: int = 200
-    """Runs of every filter."""
-    seed: int = 0
+    chunk: int = 100
     out: Path = RESULTS / "observability.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
@@ -51,7 +49,7 @@ class Observability(Benchmark):
         )
 
     def _measured(self, name: str, scenario: str) -> dict[str, Any]:
-        study, found = studied(jaxslam.scenario(scenario), name, runs=self.runs, seed=self.seed)
+        study, found = self.study(jaxslam.scenario(scenario), name)
         seconds = round(found["seconds"]["run"] / self.runs, 4)
         return at_end(found) | {"along": _along(study, name), "seconds_per_run": seconds}
 

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from benchmark import RESULTS, Benchmark, data_folder, number, table
+from benchmark import RESULTS, OfRuns, data_folder, number, table
 
 import jaxslam
 from jaxslam.consistency import run_through
@@ -55,7 +55,7 @@ NEARER = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedLoops(Benchmark):
+class RecordedLoops(OfRuns):
     """Loops along recorded trajectories."""
 
     trajectories: tuple[str, ...] = ("udel_gore", "tum_corridor1", "kitti_00")
@@ -63,11 +63,9 @@ class RecordedLoops(Benchmark):
     filter: str = "recommended"
     """The filter, with modifiers."""
     runs: int = 8
-    """Along every trajectory."""
     steps: int = 0
     """Fewer than the whole trajectory has, if not 0."""
     chunk: int = 4
-    """Runs in one batch."""
     seed: int = 11
     spare: int = 24
     """Slots for what is out of view."""

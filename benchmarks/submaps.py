@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, OfRuns, number, table
 from submaps_batch import batch_positions
 
 import jaxslam
@@ -43,17 +43,14 @@ LAPS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Submaps(Benchmark):
+class Submaps(OfRuns):
     """Submaps and loops."""
 
     scenarios: tuple[str, ...] = ("laps", "laps-6dof")
-    """What is simulated."""
     runs: int = 100
-    """Of each."""
     steps: int = 0
     """Fewer than the scenario's, if not 0."""
     chunk: int = 20
-    """Runs in one batch."""
     seed: int = 11
     spare: int = 24
     """Slots for what is out of view."""
