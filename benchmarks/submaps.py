@@ -29,6 +29,7 @@ from submaps_batch import batch_positions
 import jaxslam
 from jaxslam.consistency import run_through
 from jaxslam.filters import Chain, Loops, agreeing, base_poses, chain, close
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps.handover import SubmapsState
 from jaxslam.geometry import difference, scaled
 from jaxslam.simulation import Room, Run, Scenario, simulate
@@ -149,13 +150,12 @@ class Filtered(NamedTuple):
 
 def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str, Any]]:
     """The numbers of some runs."""
-    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(options.seed)))
-    runs = _simulated(scenario, keys(jnp.arange(indices.start, indices.stop)))
+    runs = simulated(scenario, options.seed, indices)
     slots = scenario.in_view
     room = Room(slots, slots, slots, slots)
     around = replace(slam, frame=jaxslam.Submaps(options.spare, options.history))
-    plain, _ = _filtered(slam, room, runs)
-    ours, states = _filtered(around, room, runs)
+    plain, _ = filtered(slam, room, runs)
+    ours, states = filtered(around, room, runs)
     rows = []
     for i in range(len(indices)):
         run, state, told = jax.tree.map(lambda x, i=i: x[i], (runs, states, ours))
@@ -165,26 +165,24 @@ def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str
     return rows
 
 
-def _simulated(scenario: Scenario, keys) -> Run:
+def simulated(scenario: Scenario, seed: int, indices: range) -> Run:
+    """Runs of these numbers, a batch."""
+    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(indices))
     return jax.jit(jax.vmap(lambda key: simulate(scenario, key)))(keys)
 
 
-def _filtered(slam, room: Room, runs: Run):
-    """The numbers of every step, and the last state."""
+@eqx.filter_jit
+def filtered(slam: Slam, room: Room, runs: Run) -> tuple[Filtered, Any]:
+    """What is said of every step, and the last state."""
 
     def output(state, innovation, frame):
-        del innovation
         error, P = slam.pose_error(state, frame.pose)
         nees = normalised_squared(error, P) / error.size
         if not isinstance(state, SubmapsState):
             return Filtered(nees, jnp.zeros((), int), jnp.zeros(0, int))
         return Filtered(nees, state.count, jnp.append(state.numbers, -1)[state.slots])
 
-    def one(run):
-        state, told = run_through(slam, room, run, output)
-        return told, state
-
-    return jax.jit(jax.vmap(one))(runs)
+    return jax.vmap(lambda run: run_through(slam, room, run, output)[::-1])(runs)
 
 
 def of_run(options, scenario, slam, run: Run, state, told: Filtered, index: int) -> dict[str, Any]:
