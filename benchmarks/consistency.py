@@ -2,16 +2,15 @@
 
     python benchmarks/consistency.py --scenarios matched-loose --filters robocentric --seeds 0 1 2
 
-Results are added to `consistency.json` one seed at a time, also by several such commands at once;
-seeds that a row already has are not run again. A row is one study of all runs of its seeds, which
-are as many of each; to measure it with more, remove it first. `--page` only writes
+Results are added to `consistency.json` one seed at a time; seeds that a row already has are not run
+again. A row is one study of all runs of its seeds, which are as many of each; to measure it with
+more, remove it first. `--page` only writes
 `docs/consistency.md`, from what is there.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,7 +21,7 @@ import numpy as np
 from benchmark import RESULTS, OfRuns, at_end, table
 
 import jaxslam
-from jaxslam._runtime.files import json_numbers, write_atomically
+from jaxslam._runtime.files import json_numbers
 from jaxslam.consistency import tally
 from jaxslam.statistics import Tally, mean_band
 
@@ -58,18 +57,15 @@ class Consistency(OfRuns):
     out: Path = RESULTS / "consistency.json"
 
     def measure(self) -> Iterator[Results]:
-        for scenario_name in self.scenarios:
-            scenario = jaxslam.scenario(scenario_name)
-            for name in itertools.product(self.filters, self.landmarks):
-                name = "/".join(name)
-                for seed in missing(self.found().get(scenario_name, {}).get(name), self):
-                    found = measure(scenario, name, seed, self)
-                    add_to(self.out, scenario_name, name, found)
-                    print(scenario_name, _row(name, found), flush=True)
-        yield self.found()
-
-    def save(self, results: Results) -> None:
-        """`add_to` has done it, as other commands add to the file too."""
+        results: Results = self.found()
+        each = itertools.product(self.scenarios, self.filters, self.landmarks)
+        for scenario, frame, landmarks in each:
+            name, rows = f"{frame}/{landmarks}", results.setdefault(scenario, {})
+            for seed in missing(rows.get(name), self):
+                found = measure(jaxslam.scenario(scenario), name, seed, self)
+                rows[name] = together(rows[name], found) if name in rows else found
+                print(scenario, *_row(name, found), flush=True)
+                yield results
 
     def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
         yield "consistency.md", SAID, in_words(results)
@@ -282,19 +278,6 @@ def _short(value: float | None) -> str:
     if value is None or np.isnan(value):
         return "–"
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
-
-
-def add_to(path: Path, scenario: str, name: str, found: Row) -> None:
-    """Write the file, read anew as others add to it, with a seed more, unless it is there."""
-    results: Results = json.loads(path.read_text()) if path.exists() else {}
-    filters = results.setdefault(scenario, {})
-    there = filters.get(name)
-    if there is None:
-        filters[name] = found
-    elif not set(found["seeds"]) & set(there["seeds"]):
-        filters[name] = together(there, found)
-    with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
 
 def missing(row: Row | None, options: Consistency) -> list[int]:

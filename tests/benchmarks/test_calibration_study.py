@@ -58,15 +58,3 @@ def test_the_estimate_of_the_intrinsics_is_judged_by_its_covariance():
     assert found["sigma_px"] == pytest.approx([2, np.sqrt(2)])
     low, high = jaxslam.mean_band(2, 1999, confidence=1 - 1e-6)
     assert low < found["nees"] < high
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"truths": ("wrong",)}, r"truths must be some of nominal, white, constant, not \('wrong'"),
-        ({"treatments": ()}, "treatments must be some of white, consider, estimated, known"),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(fields, message):
-    with pytest.raises(ValueError, match=message):
-        calibration.CalibrationStudy(**fields)

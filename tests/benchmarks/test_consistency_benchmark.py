@@ -84,26 +84,21 @@ def test_a_seed_is_measured_as_the_library_summarises_it(options):
         assert found[key] == expected[key]["position"][-1]
 
 
-def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, monkeypatch):
+def test_seeds_that_are_there_are_not_measured_again(options, monkeypatch):
     rng, asked = np.random.default_rng(0), []
 
     def measure(scenario, name, seed, options):
         asked.append(seed)
-        if seed == 1:  # meanwhile another command, twice
-            found = measured(rng.chisquare(3, (30, 4)), 7)
-            for _ in range(2):
-                benchmark.add_to(options.out, "circle", NAME, found)
         return measured(rng.chisquare(3, (30, 4)), seed)
 
     monkeypatch.setattr(benchmark, "measure", measure)
     options()
     dataclasses.replace(options, seeds=(0, 1, 3))()
     assert asked == [0, 1, 3]
-    found = {name: filters[NAME]["seeds"] for name, filters in options.found().items()}
-    assert found == {"matched": [0, 1, 3], "circle": [7]}
+    assert options.found()["matched"][NAME]["seeds"] == [0, 1, 3]
     page = (options.docs / "consistency.md").read_text()
-    assert "30 to 90 runs of seeds 0–1, 3, 7." in page
-    assert page.count("| `robocentric` |") == 2
+    assert "90 to 90 runs of seeds 0–1, 3." in page
+    assert page.count("| `robocentric` |") == 1
     with pytest.raises(ValueError, match=r"a row with 30 runs of every seed, not 20: remove it"):
         dataclasses.replace(options, runs=20)()
 
