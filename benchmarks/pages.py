@@ -54,11 +54,6 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         one = row(scenario, name)
         return [one["nees"][-1], lost(scenario, name), one["nees_not_lost"]]
 
-    def step(scenario: str, name: str) -> float:
-        """The time of a step relative to that of `robocentric` in the same scenario."""
-        own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
-        return own / paper
-
     def theirs(study: str, name: str) -> list[float]:
         """Our values beside those of a published table, quantity by quantity."""
         rows = files["published"]["rows"]
@@ -134,7 +129,7 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         return found["microseconds_per_step"]
 
     functions = (
-        row, mean, sigma, lost, end, step, theirs, told, along, observed, initialised, walked,
+        row, mean, sigma, lost, end, theirs, told, along, observed, initialised, walked,
         believed, filmed, accused, cautious, shown, on_gpu,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
