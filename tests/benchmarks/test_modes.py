@@ -8,7 +8,7 @@ import modes as told
 import numpy as np
 import pytest
 from cases import Case, close, quick_jit
-from modes import Modes, Worlds, followed, given_scale, modes_of_run, plot_modes, worlds_of
+from modes import Modes, Worlds, followed, given_scale, modes_of_run, plot_modes
 
 pytestmark = pytest.mark.laboratory
 
@@ -135,12 +135,3 @@ def test_the_figure_shows_who_lives_when_and_who_is_still_with_the_dead():
     assert any(line.shape == (1, 2) and np.allclose(line, point) for line in above)
     with pytest.raises(ValueError, match="known in frames 1 to 4"):
         plot_modes(data, (5, 9))
-
-
-def test_a_run_is_seen_from_above():
-    of, modes = standstill(), through()
-    path = np.asarray(of.run(0).poses.translation())[1:]
-    seen = worlds_of(of.run(0), modes, path, "mine", 30.0)
-    np.testing.assert_array_equal(seen.truth[1:], path)
-    np.testing.assert_array_equal(seen.modes.paths, modes.paths)
-    assert plot_modes(seen, (1, 3)).subfigs[-1].axes[0].get_xlabel() == "frame"

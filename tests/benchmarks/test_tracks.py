@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracks import read, window, windows
 
-from jaxslam.consistency import run_through
-from jaxslam.filters.words import make_filters
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Room, gone, scenario, sightings
+from jaxslam.simulation import Room, gone, sightings
 
 SIGHTS = {0: range(0, 4), 1: range(0, 6), 2: range(0, 2), 3: range(1, 6), 4: range(2, 6)}
 """The frames of each track, of a drive of six."""
@@ -102,25 +100,10 @@ def test_a_window_begins_anew_and_its_poses_are_relative(drive):
     np.testing.assert_array_equal(batch.controls[:, 0], np.diff(drive.times)[[0, 1, 2]])
 
 
-def test_a_filter_goes_through_a_drive(drive):
-    told = scenario("handheld", rate=10.0)
-    slam = next(iter(make_filters(told, ["robocentric"], ["inverse_scaling"]).values()))
-    run = window(drive, 0, 5, landmarks=3)
-    in_map = jax.jit(
-        lambda run: run_through(
-            slam, Room(3, 2, 3, 2), run, lambda state, innovation, frame: slam.in_map(state)
-        )[1]
-    )(run)
-    np.testing.assert_array_equal(in_map, np.asarray(run.visible)[1:])
-
-
-@pytest.mark.parametrize(("start", "steps", "count"), [(-1, 3, 2), (3, 3, 2), (0, 0, 2), (0, 3, 0)])
-def test_a_window_is_in_the_drive(drive, start, steps, count):
-    with pytest.raises(ValueError, match=r"are not in 6 frames"):
-        window(drive, start, steps, landmarks=count)
-
-
-def test_what_holds_no_tracks_is_refused(tmp_path, drive):
+def test_what_holds_no_tracks_or_no_window_is_refused(tmp_path, drive):
+    for start, steps, count in ((-1, 3, 2), (3, 3, 2), (0, 0, 2), (0, 3, 0)):
+        with pytest.raises(ValueError, match=r"are not in 6 frames"):
+            window(drive, start, steps, landmarks=count)
     (tmp_path / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
     with pytest.raises(ValueError, match="has 1 true poses of 6 frames"):
         read(tmp_path)
