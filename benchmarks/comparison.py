@@ -28,7 +28,6 @@ class Comparison(OfRuns):
     scenarios: tuple[str, ...] = ("matched", "matched-loose", "matched-forward", "circle")
     """Simulated worlds."""
     filters: tuple[str, ...] = ("robocentric", "world")
-    """Frames."""
     landmarks: tuple[str, ...] = tuple(jaxslam.LANDMARKS)
     """Landmark parametrizations; all by default."""
     runs: int = 1000

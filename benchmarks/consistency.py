@@ -44,13 +44,9 @@ class Consistency(OfRuns):
         "matched-forward-loose", "matched-turn-loose", "circle", "circle-loose",
         "matched-6dof-loose",
     )  # fmt: skip
-    """Built-in scenarios."""
     filters: tuple[str, ...] = (
         "robocentric", "scale_gauge", "scale_gauge+mixture17",
     )  # fmt: skip
-    """Filters."""
-    landmarks: tuple[str, ...] = ("inverse_scaling",)
-    """Landmark parametrizations."""
     runs: int = 1000
     seeds: tuple[int, ...] = tuple(range(20))
     """Seeds. What is measured already is not measured again."""
@@ -58,9 +54,8 @@ class Consistency(OfRuns):
 
     def measure(self) -> Iterator[Results]:
         results: Results = self.found()
-        each = itertools.product(self.scenarios, self.filters, self.landmarks)
-        for scenario, frame, landmarks in each:
-            name, rows = f"{frame}/{landmarks}", results.setdefault(scenario, {})
+        for scenario, frame in itertools.product(self.scenarios, self.filters):
+            name, rows = f"{frame}/inverse_scaling", results.setdefault(scenario, {})
             for seed in missing(rows.get(name), self):
                 found = measure(jaxslam.scenario(scenario), name, seed, self)
                 rows[name] = together(rows[name], found) if name in rows else found

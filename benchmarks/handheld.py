@@ -65,7 +65,6 @@ class Handheld(OfRuns):
     drives: tuple[str, ...] = ()
     """Names of drives with tracks; all of the data folder by default."""
     steps: int = 150
-    """Of a simulated run."""
     starts: int = 20
     """Windows of every drive."""
     frames: int = 100

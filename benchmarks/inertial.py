@@ -42,7 +42,6 @@ class Inertial(OfRuns):
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 100
     steps: int = 1600
-    """Frames of every run."""
     seed: int = 20261128
     out: Path = RESULTS / "inertial.json"
 

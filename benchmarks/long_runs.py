@@ -47,7 +47,6 @@ class LongRuns(OfRuns):
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 48
     steps: int = 3000
-    """Steps of every run."""
     seed: int = 20261128
     chunk: int = 24
     out: Path = RESULTS / "long_runs.json"

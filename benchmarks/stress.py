@@ -88,11 +88,9 @@ class Starts(Benchmark):
     sequences: Annotated[tuple[Path, ...], Positional] = ()
     """Data set folders with a reference; by default all there are in $JAXSLAM_DATA."""
     starts: int = 20
-    """Starts."""
     frames: int = 100
     """Frames that are tracked from each; of a video that is not much longer, half of it."""
     filter: str = "recommended"
-    """Filter."""
     out: Path = RESULTS / "starts.json"
     double = False
 
@@ -402,11 +400,8 @@ class Disturbances(Benchmark):
     """
 
     only: tuple[str, ...] = tuple(DISTURBANCES)
-    """Disturbances."""
     seeds: int = 5
-    """Videos of each."""
     filter: str = "recommended"
-    """Filter."""
     out: Path = RESULTS / "disturbances.json"
     double = False
 
@@ -529,11 +524,8 @@ class Endurance(Benchmark):
     sequence: Annotated[Path, Positional] = field(
         default_factory=lambda: data_folder() / "monoslam_desk"
     )
-    """Data set folder or video."""
     frames: int = 10_000
-    """Frames in all."""
     filter: str = "recommended"
-    """Filter."""
     out: Path = RESULTS / "endurance.json"
     double = False
 
