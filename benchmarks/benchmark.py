@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Union
 
@@ -30,7 +32,8 @@ def data_folder() -> Path:
     return Path(os.environ.setdefault("JAXSLAM_DATA", "../shared/data"))
 
 
-Case = tuple[tuple[str, ...], dict[str, Any], Callable[[], dict[str, Any]]]
+Row = dict[str, Any]
+Case = tuple[tuple[str, ...], Row, Callable[[], Row]]
 """The keys of a row of results, what it is of, and the function that measures the rest of it."""
 
 
@@ -120,6 +123,17 @@ class OfRuns(Benchmark):
     """Run i draws from this seed and i alone."""
     chunk: int = 25
     """Runs in one batch."""
+
+    def each(
+        self, measure: Callable[[str, str], Row], worlds: Iterable[str], names: Iterable[str],
+        above: tuple[str, ...] = (), **of: Any,
+    ) -> Iterator[Row]:  # fmt: skip
+        """The results with every name in every world, name by name: worlds share its programs."""
+        of |= {"runs": self.runs, "seed": self.seed}
+        yield from self.added(
+            ((*above, world, name), of, partial(measure, world, name))
+            for name, world in itertools.product(names, worlds)
+        )
 
     def study(
         self, scenario: jaxslam.Scenario, name: str, seed: int | None = None

@@ -6,10 +6,8 @@ and `docs/comparison.md`.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,16 +37,8 @@ class Comparison(OfRuns):
         after every filter."""
         of = {"schema": 1, "version": jaxslam.__version__, "runs": self.runs, "seed": self.seed}
         of["device"] = jax.devices()[0].device_kind
-        # Filter by filter, so that scenarios of one shape share its compiled program.
-        each = itertools.product(self.landmarks, self.filters, self.scenarios)
-        for results in self.added(
-            (
-                ("scenarios", scenario, f"{frame}/{landmarks}"),
-                {"runs": self.runs},
-                partial(self._measured, scenario, f"{frame}/{landmarks}"),
-            )
-            for landmarks, frame, scenario in each
-        ):
+        names = [f"{frame}/{x}" for x in self.landmarks for frame in self.filters]
+        for results in self.each(self._measured, self.scenarios, names, ("scenarios",)):
             yield of | {"scenarios": results["scenarios"]}
 
     def _measured(self, name: str, slam: str) -> dict[str, Any]:

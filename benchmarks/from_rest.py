@@ -11,10 +11,8 @@ there. `--figure` draws one run beside it, whose modes live long.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,11 +63,7 @@ class FromRest(OfRuns):
         if self.figure:
             draw_figure(self)
             return
-        of = {"runs": self.runs, "seed": self.seed}
-        yield from self.added(
-            ((scenario, name), of, partial(self._measured, scenario, name))
-            for scenario, name in itertools.product(self.scenarios, self.filters)
-        )
+        yield from self.each(self._measured, self.scenarios, self.filters)
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         _, found = self.study(jaxslam.scenario(scenario), name)

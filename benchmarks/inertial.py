@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +47,7 @@ class Inertial(OfRuns):
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[trajectory][filter]`: NEES per degree of freedom of orientation and position, of every
         third and of the last second, and the share of lost runs."""
-        of = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        yield from self.added(
-            ((trajectory, name), of, partial(self._measured, trajectory, name))
-            for trajectory in self.trajectories
-            for name in self.filters
-        )
+        yield from self.each(self._measured, self.trajectories, self.filters, steps=self.steps)
 
     def _measured(self, trajectory: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario("imu", RECIPE, trajectory=trajectory, sway=[], steps=self.steps)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +52,7 @@ class LongRuns(OfRuns):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[scenario][filter]`: mean and median NEES and the share of lost runs `at` some steps."""
-        of = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        yield from self.added(
-            ((scenario, name), of, partial(self._measured, scenario, name))
-            for scenario in self.scenarios
-            for name in self.filters
-        )
+        yield from self.each(self._measured, self.scenarios, self.filters, steps=self.steps)
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario(scenario, {"steps": self.steps})

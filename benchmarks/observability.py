@@ -7,10 +7,8 @@ Rows that the file has with as many runs are not run again.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +39,9 @@ class Observability(OfRuns):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add to `{scenario: {"filter/landmarks": numbers at the end}}`."""
-        of = {"runs": self.runs, "seed": self.seed}
-        # Filter by filter, so that scenarios of one shape share its compiled program.
-        yield from self.added(
-            (("scenarios", scenario, name), of, partial(self._measured, name, scenario))
-            for name, scenario in itertools.product(self.filters, self.scenarios)
-        )
+        yield from self.each(self._measured, self.scenarios, self.filters, ("scenarios",))
 
-    def _measured(self, name: str, scenario: str) -> dict[str, Any]:
+    def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         study, found = self.study(jaxslam.scenario(scenario), name)
         seconds = round(found["seconds"]["run"] / self.runs, 4)
         return at_end(found) | {"along": _along(study, name), "seconds_per_run": seconds}

@@ -170,11 +170,7 @@ def affine(odometry: float, position: float) -> Study:
 
 STUDIES = {
     "room": Study(
-        SLAMTB,
-        partial(scenario, "room"),
-        25,
-        100,
-        ROOM,
+        SLAMTB, partial(scenario, "room"), 25, 100, ROOM,
         {
             "world/inverse_depth": (6.99, 6.57, 6.88, 0.082),
             "world/anchored_homogeneous": (7.00, 6.54, 6.83, 0.082),
