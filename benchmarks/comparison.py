@@ -1,7 +1,10 @@
-"""Every landmark parametrization in every frame: NEES, RMSE, σ/RMSE and time per step.
+"""Filters side by side: NEES, RMSE, σ/RMSE and time per step at the end of the same runs.
 
-`python benchmarks/comparison.py` runs them all, 1000 runs each, and writes `comparison.json`
-and `docs/comparison.md`.
+    python benchmarks/comparison.py parametrizations
+    python benchmarks/comparison.py observability
+
+The first writes `comparison.json` and the tables of `docs/comparison.md`, the second
+`observability.json`, whose numbers stand in `docs/rivals.md`.
 """
 
 from __future__ import annotations
@@ -12,16 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from benchmark import RESULTS, OfRuns, at_end, number, table
+import numpy as np
+from benchmark import RESULTS, OfRuns, at_end, number, run_one, table
 
 import jaxslam
+from jaxslam.consistency import Study
 
 NUMBERS, PARAMETRIZATIONS = "<!-- comparison.py -->", "<!-- all parametrizations -->"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(OfRuns):
-    """Parametrizations in frames in worlds."""
+class Parametrizations(OfRuns):
+    """Every landmark parametrization in every frame."""
 
     scenarios: tuple[str, ...] = ("matched", "matched-loose", "matched-forward", "circle")
     """Simulated worlds."""
@@ -90,5 +95,52 @@ def as_table(results: dict[str, dict[str, Any]], runs: int) -> str:
     return f"{told}\n\n†: fewer runs, {few} instead of {runs}."
 
 
+@dataclass(frozen=True, kw_only=True)
+class Observability(OfRuns):
+    """Do filters that respect what cannot be observed help a single camera?
+
+    Every frame plain, observability-constrained (`+oc`), with first-estimate Jacobians (`+fej`) and
+    invariant. Rows that the file has with as many runs are not run again.
+    """
+
+    filters: tuple[str, ...] = (
+        "robocentric/inverse_scaling", "robocentric+oc/inverse_scaling",
+        "world/inverse_scaling", "world+oc/inverse_scaling", "world+fej/inverse_scaling",
+        "world+fej2/inverse_scaling", "world+decoupled/inverse_scaling",
+        "invariant/inverse_scaling", "robocentric/inverse_depth", "robocentric+oc/inverse_depth",
+        "world/inverse_depth", "world+oc/inverse_depth",
+    )  # fmt: skip
+    """`filter/landmarks`."""
+    scenarios: tuple[str, ...] = (
+        "matched", "matched-loose", "matched-forward", "matched-forward-loose", "circle",
+    )  # fmt: skip
+    chunk: int = 100
+    out: Path = RESULTS / "observability.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """Add to `{scenario: {"filter/landmarks": numbers at the end}}`."""
+        yield from self.each(self._measured, self.scenarios, self.filters, ("scenarios",))
+
+    def _measured(self, scenario: str, name: str) -> dict[str, Any]:
+        study, found = self.study(jaxslam.scenario(scenario), name)
+        seconds = round(found["seconds"]["run"] / self.runs, 4)
+        return at_end(found) | {"along": _along(study, name), "seconds_per_run": seconds}
+
+
+def _along(study: Study, name: str) -> dict[str, float]:
+    """Median over the runs of the last step's |error| and σ along the nominal direction of
+    motion, m: with a single camera both are those of the scale."""
+    axis = int(np.argmax(np.abs(study.scenario.velocity[: study.scenario.geometry.point_dim])))
+    records = [study.store.load(name, chunk, ("error", "variance")) for chunk in study.chunks]
+    error, variance = (
+        np.concatenate([record[key][:, -1, axis] for record in records])
+        for key in ("error", "variance")
+    )
+    return {
+        "error": round(float(np.nanmedian(np.abs(error))), 4),
+        "sigma": round(float(np.nanmedian(np.sqrt(variance))), 4),
+    }
+
+
 if __name__ == "__main__":
-    Comparison.run()
+    run_one(Parametrizations, Observability)

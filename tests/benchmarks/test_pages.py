@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from benchmark import END
 from calibration import CalibrationStudy
-from comparison import Comparison
+from comparison import Parametrizations
 from consistency import Consistency
 from from_rest import FromRest
 from handheld import Handheld
@@ -25,8 +25,9 @@ from benchmarks.speed.gpu import OnGpu
 RESULTS = read(Path("benchmarks/results"))
 OF_RESULTS = [page for page in pages() if MARK.search(page.read_text())]
 WRITERS = [
-    CalibrationStudy, Comparison, Consistency, Disturbances, Endurance, FromRest, Handheld, OnGpu,
-    OneRunStudy, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps, Tables, Verdicts,
+    CalibrationStudy, Consistency, Disturbances, Endurance, FromRest, Handheld, OnGpu, OneRunStudy,
+    Parametrizations, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps, Tables,
+    Verdicts,
 ]  # fmt: skip
 SAID = {
     "the best of all parametrizations": """min(
