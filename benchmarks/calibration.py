@@ -8,8 +8,7 @@ for a camera that turns and one that does not, and writes `calibration.json` and
 
 from __future__ import annotations
 
-import json
-import time
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -20,18 +19,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_page
+from benchmark import RESULTS, OfRuns, at_end, by_batch, number, table
 
 import jaxslam
-from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes, filter_run
+from jaxslam.consistency import MemoryStore, Seconds, Study, draw, filter_run
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Room, Run, Scenario, sightings, simulate
-from jaxslam.simulation.world import CALIBRATIONS
+from jaxslam.simulation import Room, Run, Scenario
 from jaxslam.statistics import mean_band, normalised_squared
 from jaxslam.statistics.verdict import LOST_BOUND
 
+MARK, SAID = "<!-- calibration.py -->", "<!-- calibration.py, in words -->"
 TRUTH = {
     "white": "drawn in every frame",
     "constant": "drawn once per run",
@@ -40,7 +39,7 @@ TRUTH = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationStudy(Benchmark):
+class CalibrationStudy(OfRuns):
     """Treatments under truths in worlds."""
 
     scenarios: tuple[str, ...] = ("circle", "matched")
@@ -52,18 +51,9 @@ class CalibrationStudy(Benchmark):
     filters: tuple[str, ...] = ("robocentric",)
     landmarks: tuple[str, ...] = ("inverse_scaling",)
     runs: int = 400
-    seed: int = 0
+    chunk: int = 100
     steps: int = 60
     out: Path = RESULTS / "calibration.json"
-
-    def __post_init__(self) -> None:
-        for kind, names, known in (
-            ("truths", self.truths, tuple(CALIBRATIONS)),
-            ("treatments", self.treatments, tuple(TREATMENTS)),
-        ):
-            if not names or set(names) - set(known):
-                raise ValueError(f"{kind} must be some of {', '.join(known)}, not {names}")
-        check_sizes(self.runs, self.seed, "float64", CHUNK)
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`{"scenarios": {scenario: {truth: {"filter/landmarks": {treatment: numbers}}}}}` and what
@@ -76,73 +66,52 @@ class CalibrationStudy(Benchmark):
                 truth: jaxslam.scenario(name, steps=self.steps, true_calibration=truth)
                 for truth in self.truths
             }
-            drawn = {truth: draw(scenario, self) for truth, scenario in worlds.items()}
+            drawn = {
+                truth: draw(world, self.runs, seed=self.seed) for truth, world in worlds.items()
+            }
             # One room for all truths, so that a filter compiles once.
-            seen = [count for chunks in drawn.values() for _, count in chunks]
-            most = jax.tree.map(lambda *counts: max(1, *(int(c) for c in counts)), *seen)
-            room = Room(most.landmarks, most.first, most.known, most.new)
+            rooms = (room for room, _ in drawn.values())
+            room = Room(*np.max([*rooms], axis=0).tolist())
             results[name] = {}
             for truth, scenario in worlds.items():
-                runs = [chunk for chunk, _ in drawn[truth]]
-                results[name][truth] = _measure(scenario, runs, room, self)
+                rows = results[name].setdefault(truth, {})
+                each = itertools.product(self.treatments, self.filters, self.landmarks)
+                for treatment, frame, landmark in each:
+                    filters = jaxslam.make_filters(scenario, [frame], [landmark], treatment)
+                    ((key, slam),) = filters.items()
+                    found = self.measured(slam, scenario, room, drawn[truth][1], treatment)
+                    rows.setdefault(key, {})[treatment] = found
+                    print(name, truth, key, treatment, flush=True)
                 yield {**of, "scenarios": results}
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_page(self.docs / "calibration.md", page(results))
+    def measured(
+        self, slam: AbstractFilter, scenario: Scenario, room: Room, runs: Run, treatment: str
+    ) -> dict[str, Any]:
+        """Numbers of the last step; of intrinsics where they are estimated."""
+        sensor, store, every = scenario.sensor, MemoryStore(), range(self.runs)
+        assert isinstance(sensor, Pinhole)
+        records, last = by_batch(partial(_batch, slam, room, sensor), runs, self.chunk)
+        store.save("slam", every, records)
+        study = Study(
+            scenario, {"slam": slam}, self.runs, self.seed, "float64", (every,), store,
+            {"slam": Seconds(0.0, 0.0)}, jax.devices()[0].device_kind,
+        )  # fmt: skip
+        f = jaxslam.summarise(study)["filters"]["slam"]
+        row = at_end(f)
+        rmse, sigma, band = row.pop("rmse"), row.pop("sigma"), mean_band(row["dof"], self.runs)
+        verdict = "lost" if row["diverged"] else _verdict(row["nees"], row["lost"], band)
+        nis, dof = (float(np.nansum(np.array(f[key], float))) for key in ("nis", "nis_dof"))
+        return row | {
+            "verdict": verdict,
+            "rmse_m": rmse,
+            "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
+            "nis_per_dof": nis / dof,
+            "intrinsics": _intrinsics(last) if treatment == "estimated" else None,
+        }
 
-
-def draw(scenario: Scenario, options: CalibrationStudy) -> list[tuple[Run, Room]]:
-    """Chunks of runs, and what they see at the most."""
-    key = jax.random.key(options.seed)
-
-    @jax.jit
-    def chunk(indices):
-        keys = jax.vmap(partial(jax.random.fold_in, key))(indices)
-        runs = jax.vmap(lambda key: simulate(scenario, key))(keys)
-        return runs, jax.tree.map(jnp.max, jax.vmap(sightings)(runs))
-
-    return [chunk(jnp.arange(part.start, part.stop)) for part in _chunks(options.runs)]
-
-
-def _chunks(runs: int) -> tuple[range, ...]:
-    return tuple(range(i, min(i + CHUNK, runs)) for i in range(0, runs, CHUNK))
-
-
-def _measure(
-    scenario, runs: list[Run], room: Room, options: CalibrationStudy
-) -> dict[str, dict[str, Any]]:
-    results: dict[str, dict[str, Any]] = {}
-    for treatment in options.treatments:
-        filters = jaxslam.make_filters(scenario, options.filters, options.landmarks, treatment)
-        for name, slam in filters.items():
-            start = time.perf_counter()
-            study, intrinsics = _run(name, slam, scenario, runs, room, options)
-            numbers = _numbers(jaxslam.summarise(study)["filters"][name], options.runs)
-            numbers["intrinsics"] = _intrinsics(intrinsics) if treatment == "estimated" else None
-            results.setdefault(name, {})[treatment] = numbers
-            seconds = time.perf_counter() - start
-            print(scenario.name, scenario.calibration.word, name, treatment, f"{seconds:.0f} s")
-            print(json.dumps(numbers), flush=True)
-    return results
-
-
-def _run(
-    name, slam, scenario, runs: list[Run], room: Room, options: CalibrationStudy
-) -> tuple[Study, Mapping[str, np.ndarray]]:
-    """The study of one filter, and the last error of its intrinsics with their covariance."""
-    store, chunks, sensor = MemoryStore(), _chunks(options.runs), scenario.sensor
-    assert isinstance(sensor, Pinhole)
-    intrinsics = []
-    for part, chunk in zip(chunks, runs, strict=True):
-        records, last = jax.device_get(_batch(slam, room, sensor, chunk))
-        store.save(name, part, records)
-        intrinsics.append(last)
-    joined = {key: np.concatenate([x[key] for x in intrinsics]) for key in intrinsics[0]}
-    study = Study(
-        scenario, {name: slam}, options.runs, options.seed, "float64", chunks, store,
-        {name: Seconds(0.0, 0.0)}, jax.devices()[0].device_kind,
-    )  # fmt: skip
-    return study, joined
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "calibration.md", SAID, in_words(results)
+        yield "calibration.md", MARK, as_tables(results["scenarios"])
 
 
 @eqx.filter_jit
@@ -158,25 +127,6 @@ def _batch(slam: AbstractFilter, room: Room, sensor: Pinhole, runs: Run):
         return records, {"error": error, "covariance": covariance}
 
     return jax.vmap(one)(runs)
-
-
-def _numbers(f: dict[str, Any], runs: int) -> dict[str, Any]:
-    """Those of the last step."""
-    rmse, sigma = f["rmse"]["position"][-1], f["sigma"]["position"][-1]
-    nees, lost = f["nees"][-1], f["lost"][-1]
-    return {
-        "nees": nees,
-        "nees_median": f["nees_median"][-1],
-        "band95": f["band95"],
-        "dof": f["dof"],
-        "lost": lost,
-        "diverged": f["diverged"],
-        "verdict": "lost" if f["diverged"] else _verdict(nees, lost, mean_band(f["dof"], runs)),
-        "rmse_m": rmse,
-        "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
-        "nis_per_dof": float(np.nansum(np.array(f["nis"], float)))
-        / float(np.nansum(np.array(f["nis_dof"], float))),
-    }
 
 
 def _verdict(nees: float | None, lost: float, band: tuple[float, float]) -> str:
@@ -206,38 +156,17 @@ def _intrinsics(last: Mapping[str, np.ndarray]) -> dict[str, Any]:
 # --- what it says -------------------------------------------------------------------------------
 
 
-def page(summary: dict[str, Any]) -> str:
-    """The Markdown page."""
-    first = next(iter(summary["scenarios"].values()))
-    low, high = mean_band(3, summary["runs"])
-    parts = [
-        "# How should a filter treat an uncertain calibration?",
-        _conclusion(summary),
-        "The filter treats the calibration as `white` (independent in every frame, as the paper "
-        "does), `consider` (constant, correlated, not corrected), `estimated` (constant, "
-        "corrected) or `known`. The true calibration is drawn in every frame (`white`), once per "
-        "run (`constant`), or is exactly the nominal one (`nominal`).",
-        f"The filter is {', '.join(next(iter(first.values())))} in the plane, with σ of the focal "
-        "length 3 px and of the principal point 2 px. Numbers are of the last step. **Bold** NEES "
-        f"is consistent: within {low:.2f}–{high:.2f} (ideal 3; 95 %), and at most 1 % of the runs "
-        "lost. `known` under the truth `nominal` shows the inconsistency that has other reasons.",
-    ]
-    for name, by_truth in summary["scenarios"].items():
+def as_tables(scenarios: dict[str, Any]) -> str:
+    """A part of the page for every scenario: all rows, and the estimates of intrinsics."""
+    parts = []
+    for name, by_truth in scenarios.items():
         parts += [f"## `{name}`", _rows(by_truth)]
-        estimates = _estimates(by_truth)
-        if estimates:
-            parts += [
-                "The final intrinsics of `estimated` (initial σ 3 and 2 px):",
-                estimates,
-            ]
-    parts.append(
-        f"Measured by `python benchmarks/calibration.py --runs {summary['runs']}`, which writes "
-        f"this page: {summary['runs']} runs of {summary['steps']} steps, seed {summary['seed']}."
-    )
-    return "\n\n".join(parts) + "\n"
+        if estimates := _estimates(by_truth):
+            parts += ["The final intrinsics of `estimated` (initial σ 3 and 2 px):", estimates]
+    return "\n\n".join(parts)
 
 
-def _conclusion(summary: dict[str, Any]) -> str:
+def in_words(summary: dict[str, Any]) -> str:
     """The best treatments of every truth over all worlds, and what believing too much costs."""
     best, costs = [], []
     for truth in summary["truths"]:
@@ -252,10 +181,7 @@ def _conclusion(summary: dict[str, Any]) -> str:
         best.append(f"- **{TRUTH[truth].capitalize()}**: {named} (NEES of {numbers}).")
         if "known" in worst and truth != "nominal":
             costs.append(f"{worst['known'] / least:.0f} times ({TRUTH[truth]})")
-    text = (
-        "Use the treatment that matches how the calibration varies. These have the lowest mean "
-        "NEES in the worst of the scenarios:\n\n" + "\n".join(best)
-    )
+    text = "\n".join(best)
     if costs:
         text += (
             "\n\nA filter that takes an uncertain calibration as `known` has "
@@ -276,17 +202,8 @@ def _worst(summary: dict[str, Any], truth: str) -> dict[str, float]:
 
 
 def _rows(by_truth: dict[str, Any]) -> str:
-    header = (
-        "truth",
-        *_unless_alone("filter", by_truth),
-        "treatment",
-        "NEES",
-        "median",
-        "lost",
-        "RMSE m",
-        "σ/RMSE",
-        "NIS/dof",
-    )
+    filters = _unless_alone("filter", by_truth)
+    header = "truth", *filters, "treatment", "NEES", "median", "lost", "RMSE m", "σ/RMSE", "NIS/dof"
     rows = []
     for truth, name, treatment, f in _each(by_truth):
         mean = number(f["nees"])
@@ -294,11 +211,8 @@ def _rows(by_truth: dict[str, Any]) -> str:
             (
                 *(truth, *_unless_alone(name, by_truth), treatment),
                 f"**{mean}**" if f["verdict"] == "consistent" else mean,
-                number(f["nees_median"]),
-                f"{f['lost']:.1%}",
-                number(f["rmse_m"], ".3f"),
-                number(f["sigma_over_rmse"]),
-                number(f["nis_per_dof"]),
+                *(number(f["nees_median"]), f"{f['lost']:.1%}", number(f["rmse_m"], ".3f")),
+                *(number(f[key]) for key in ("sigma_over_rmse", "nis_per_dof")),
             )
         )
     return table(header, rows)

@@ -33,7 +33,6 @@ class Circle(Benchmark):
     printed: int = 500
     """Runs of the README's command."""
     steps: int = 200
-    """Steps of every run."""
     out: Path = RESULTS / "circle.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:

@@ -2,16 +2,15 @@
 
     python benchmarks/consistency.py --scenarios matched-loose --filters robocentric --seeds 0 1 2
 
-Results are added to `consistency.json` one seed at a time, also by several such commands at once;
-seeds that a row already has are not run again. A row is one study of all runs of its seeds, which
-are as many of each; to measure it with more, remove it first. `--page` only writes
+Results are added to `consistency.json` one seed at a time; seeds that a row already has are not run
+again. A row is one study of all runs of its seeds, which are as many of each; to measure it with
+more, remove it first. `--page` only writes
 `docs/consistency.md`, from what is there.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,30 +18,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import END, RESULTS, Benchmark, write_page, write_table
-from verdicts import BEGIN
-from verdicts import as_table as table_of_verdicts
+from benchmark import RESULTS, OfRuns, at_end, table
 
 import jaxslam
-from jaxslam._runtime.files import json_numbers, write_atomically
+from jaxslam._runtime.files import json_numbers
 from jaxslam.consistency import tally
 from jaxslam.statistics import Tally, mean_band
 
 Row = dict[str, Any]
 Results = dict[str, dict[str, Row]]
 """`results[scenario][filter/landmarks]`: what `measure` returns of one seed, `together` of more."""
-LAYOUT = 3
-"""Of a row; what has another is measured again."""
 TALLIES = ("tally", "one_scale", "drift")
-VERDICTS = RESULTS / "verdicts.json"
-MARK = "<!-- consistency.py -->"
+MARK, SAID = "<!-- consistency.py -->", "<!-- consistency.py, in words -->"
 IN_README = ("matched", "matched-loose", "matched-forward-loose")
 STEPS = (5, 10)
 """Steps whose mean NEES the page shows, beside the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Consistency(Benchmark):
+class Consistency(OfRuns):
     """Filters in scenarios on seeds."""
 
     scenarios: tuple[str, ...] = (
@@ -50,67 +44,47 @@ class Consistency(Benchmark):
         "matched-forward-loose", "matched-turn-loose", "circle", "circle-loose",
         "matched-6dof-loose",
     )  # fmt: skip
-    """Built-in scenarios."""
     filters: tuple[str, ...] = (
         "robocentric", "scale_gauge", "scale_gauge+mixture17",
     )  # fmt: skip
-    """Filters."""
-    landmarks: tuple[str, ...] = ("inverse_scaling",)
-    """Landmark parametrizations."""
     runs: int = 1000
-    """Runs of every seed."""
     seeds: tuple[int, ...] = tuple(range(20))
     """Seeds. What is measured already is not measured again."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "consistency.json"
 
-    def found(self) -> Results:
-        return read(self.out)
-
     def measure(self) -> Iterator[Results]:
-        for scenario_name in self.scenarios:
-            scenario = jaxslam.scenario(scenario_name)
-            for name in itertools.product(self.filters, self.landmarks):
-                name = "/".join(name)
-                for seed in missing(self.found().get(scenario_name, {}).get(name), self):
-                    found = measure(scenario, name, seed, self)
-                    add_to(self.out, scenario_name, name, found)
-                    print(scenario_name, _row(name, found), flush=True)
-        yield self.found()
+        results: Results = self.found()
+        for scenario, frame in itertools.product(self.scenarios, self.filters):
+            name, rows = f"{frame}/inverse_scaling", results.setdefault(scenario, {})
+            for seed in missing(rows.get(name), self):
+                found = measure(jaxslam.scenario(scenario), name, seed, self)
+                rows[name] = together(rows[name], found) if name in rows else found
+                print(scenario, *_row(name, found), flush=True)
+                yield results
 
-    def save(self, results: Results) -> None:
-        """`add_to` has done it, as other commands add to the file too."""
-
-    def report(self, results: Results) -> None:
-        write_page(self.docs / "consistency.md", page(results))
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
+        yield "consistency.md", SAID, in_words(results)
+        yield "consistency.md", MARK, as_table(results)
         if self.page:
-            write_table(self.docs.parent / "README.md", MARK, recommended(results, IN_README))
-            write_table(self.docs / "results.md", MARK, beside(results))
+            yield "../README.md", MARK, recommended(results, IN_README)
+            yield "results.md", MARK, beside(results)
 
 
 def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Consistency) -> Row:
     """One filter on one seed: numbers from which those of many seeds follow."""
-    frame, landmarks = name.rsplit("/", 1)
-    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
-    study = jaxslam.monte_carlo(
-        scenario, filters, runs=options.runs, seed=seed, chunk=options.chunk
-    )
-    ((key, f),) = jaxslam.summarise(study)["filters"].items()
+    study, f = options.study(scenario, name, seed)
+    (key,) = study.filters
     nis = np.sum(np.array(f["nis"], float)) / np.sum(np.array(f["nis_dof"], float))
+    last = at_end(f)
     return {
-        "layout": LAYOUT,
         "seeds": [seed],
         "runs": options.runs,
         "tally": tally(study, key).asdict(),
         "one_scale": tally(study, key, "beyond_scale").asdict(),
         "drift": tally(study, key, "drift").asdict(),
         "nees": f["nees"],
-        "lost": round(f["lost"][-1] * options.runs),
-        "nees_median": f["nees_median"][-1],
-        "nees_not_lost": f["nees_not_lost"][-1],
-        "rmse": f["rmse"]["position"][-1],
-        "sigma": f["sigma"]["position"][-1],
+        "lost": round(last["lost"] * options.runs),
+        **{of: last[of] for of in ("nees_median", "nees_not_lost", "rmse", "sigma")},
         "nis_per_dof": float(nis),
         "microseconds_per_step": 1e6 * f["seconds"]["run"] / options.runs / scenario.steps,
     }
@@ -132,14 +106,13 @@ def together(one: Row, other: Row) -> Row:
     def root(key: str) -> np.ndarray:
         return np.sqrt(_weighed(np.array([row[key] for row in both], float) ** 2, survivors))
 
+    of_seeds = "nees_median", "nis_per_dof", "microseconds_per_step"
     numbers = {
         "nees_not_lost": mean("nees_not_lost", kept),
-        **{key: mean(key, seeds) for key in ("nees_median", "nis_per_dof")},
-        "microseconds_per_step": mean("microseconds_per_step", seeds),
+        **{key: mean(key, seeds) for key in of_seeds},
         **{key: root(key) for key in ("rmse", "sigma")},
     }
     return {
-        "layout": LAYOUT,
         "seeds": sorted(one["seeds"] + other["seeds"]),
         "runs": one["runs"] + other["runs"],
         "lost": one["lost"] + other["lost"],
@@ -165,56 +138,23 @@ def verdicts_of(row: Row) -> dict[str, dict[str, Any]]:
     return {key: Tally.from_dict(row[key]).verdict() for key in TALLIES if key in row}
 
 
-def page(results: Results, verdicts: Path = VERDICTS) -> str:
-    """The Markdown page, with the table of `verdicts.py` where that was run."""
-    rows = [row for filters in results.values() for row in filters.values()]
-    seeds = f"seeds {named({s for row in rows for s in row['seeds']})}" if rows else "its seeds"
-    counts = sorted({row["runs"] for row in rows}) or [0]
-    lines = [
-        "# Which filter is consistent in which scenario?",
-        "",
-        *in_words(results),
-        "",
-        "All filters use Inverse Scaling. `recommended` is",
-        "`scale_gauge+oc+scene50+walk3+mixture17`, in space `mixture9`; a name that begins with",
-        "`+` continues `scale_gauge`. What the filters do is on [another page](repairs.md).",
-        "Written by `python benchmarks/consistency.py`; a row",
-        f"is one study of {counts[0]} to {counts[-1]} runs of {seeds}.",
-        "",
-        "- *NEES* is of the camera pose; a consistent filter has 3 on average, 6 in space.",
-        "- *σ should be ×*: √(NEES/ideal) over all steps, with its 99 % interval.",
-        "- *Verdict*: of all steps, the last step and each third of the runs together; in brackets",
-        "  the part that decided.",
-        "- *At one scale; drift*: the verdict on NEES at the scale of each run that explains its",
-        "  poses best, and on the drift of scale, of which only over-confidence can be proven",
-        "  ([units of length](gauge.md)). *Yes* is consistent, *over* and *under* are",
-        "  over-confident and under-confident, *?* cannot be decided.",
-        "- *NEES at steps*: the mean over all runs, bold inside its exact 95 % band.",
-        "- *Lost*: the share of runs above the 99.99 % quantile of χ² at the last step; *ever*:",
-        "  above a stricter limit, for so many steps, at any step.",
-        "- *RMSE; σ* are those of the position at the last step. –: a run diverged, so there is no",
-        "  mean. Medians and means without lost runs are in `benchmarks/results/consistency.json`.",
-    ]
-    if any("drift" not in row for row in rows):
-        lines += [
-            "- †: measured before verdicts looked at thirds and at drift: the verdict is of all",
-            "  steps and the last one, and *ever* uses the quantile of a single step.",
-        ]
-    lines += [
-        "",
-        "| scenario, filter | NEES, all steps | σ should be × | verdict "
-        f"| at one scale; drift | NEES at steps {', '.join(map(str, STEPS))}, last "
-        "| lost; ever | RMSE; σ, m |",
-        f"|{'---|' * COLUMNS}",
-    ]
+def as_table(results: Results) -> str:
+    """All rows, by scenario."""
+    steps = ", ".join(map(str, STEPS))
+    header = [
+        "scenario, filter", "NEES, all steps", "σ should be ×", "verdict", "at one scale; drift",
+        f"NEES at steps {steps}, last", "lost; ever", "RMSE; σ, m",
+    ]  # fmt: skip
+    rows: list[list[str]] = []
     for name, filters in results.items():
-        lines.append(f"| **`{name}`** {'|' * COLUMNS}")
-        lines += [_row(key, row) for key, row in filters.items()]
-    return "\n".join([*lines, *_of_verdicts(verdicts)]) + "\n"
+        rows.append([f"**`{name}`**", *[""] * (len(header) - 1)])
+        rows += [_row(key, row) for key, row in filters.items()]
+    return table(header, rows)
 
 
-def in_words(results: Results) -> list[str]:
-    """In how many scenarios each filter is consistent, and by how much σ is wrong elsewhere."""
+def in_words(results: Results) -> str:
+    """In how many scenarios each filter is consistent, by how much σ is wrong elsewhere, and of how
+    many runs that is."""
     lines = []
     for name in ("robocentric", "scale_gauge", "recommended"):
         found = [
@@ -229,7 +169,10 @@ def in_words(results: Results) -> list[str]:
                 f"- `{name}` is consistent in {right} of {len(found)} scenarios. Over all steps "
                 f"its σ should be multiplied by {min(factors):.3g} to {max(factors):.3g}."
             )
-    return lines
+    rows = [row for filters in results.values() for row in filters.values()]
+    runs, seeds = [row["runs"] for row in rows], {seed for row in rows for seed in row["seeds"]}
+    told = f"A row is one study of {min(runs)} to {max(runs)} runs of seeds {named(seeds)}."
+    return "\n".join([*lines, "", told])
 
 
 def label(name: str) -> str:
@@ -242,113 +185,79 @@ def label(name: str) -> str:
     return slam.replace("scale_gauge+", "+")
 
 
-def _of_verdicts(path: Path) -> list[str]:
-    """How often a verdict is wrong."""
-    if not path.exists():
-        return []
-    return [
-        "",
-        "## How often a verdict is wrong",
-        "",
-        "Fewer than 1.1 % of the studies of a consistent filter are called inconsistent, and",
-        "hardly any filter whose σ is wrong by 1.3 is called consistent. A σ that is wrong by 1.3",
-        "is found surely with 300 runs, and one that is wrong by 2 with 100.",
-        "",
-        "`python benchmarks/verdicts.py verdicts` draws NEES as a filter would have it: with 1,",
-        "2, 3 and 6 degrees of freedom, of one step, and of 12 steps that are independent or",
-        "correlated by 0.98. For each number of runs the table has the worst of all these, or",
-        "their range. In the column of opposite faults NEES/dof grows from 0.7 at the start to",
-        "1.3 at the end. The last column is the share of intervals of σ that hold the truth where",
-        "1 % of the runs have twenty times the variance. The interval allows for three runs that",
-        "are just lost, in case a study has none of those.",
-        "",
-        BEGIN,
-        "",
-        table_of_verdicts(json.loads(path.read_text())),
-        "",
-        END,
-    ]
-
-
-COLUMNS = 8
 BRIEF = {"consistent": "yes", "over-confident": "over", "under-confident": "under"}
 
 
-def _row(name: str, row: Row) -> str:
+def _row(name: str, row: Row) -> list[str]:
     told = verdicts_of(row)
     verdict, mean = told["tally"], told["tally"]["mean"]
-    decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
     survivors = row["runs"] - row["tally"]["diverged"]
     low, high = mean_band(row["tally"]["dof"], max(survivors, 1))
     if verdict["nees"] is None:
         low, high = np.inf, -np.inf
     steps = (*(s - 1 for s in STEPS if s < len(row["nees"])), -1)
-    nees = [_number(row["nees"][step]) for step in steps]
+    nees = [np.nan if row["nees"][step] is None else row["nees"][step] for step in steps]
     brief = (BRIEF.get(told[key]["word"], "?") for key in TALLIES[1:] if key in told)
-    cells = [
+    return [
         f"`{label(name)}`{'' if 'drift' in row else ' †'}",
         _short(mean["nees"]),
-        _factor(mean, 2),
-        f"{verdict['word']}{decided}",
+        _factor(mean),
+        _decided(verdict),
         "; ".join(brief) or "–",
         " ".join(f"**{_short(n)}**" if low <= n <= high else _short(n) for n in nees),
         f"{row['lost'] / row['runs']:.2%}; {verdict['lost']:.2%}",
         f"{row['rmse']:.3f}; {row['sigma']:.3f}",
     ]
-    return f"| {' | '.join(cells)} |"
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
+def _decided(verdict: dict[str, Any]) -> str:
+    """The word, and the part that decided."""
+    part = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
+    return f"{verdict['word']}{part}"
 
 
 def recommended(results: Results, scenarios: Iterable[str]) -> str:
     """The table of the paper's filter and the recommended one, by scenario."""
-    rows = [
-        "| scenario | filter | NEES: all; last | σ should be × | verdict | lost | RMSE, σ, m |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for scenario in scenarios:
-        for name, row in results[scenario].items():
-            if label(name) in ("robocentric", "recommended"):
-                rows.append(f"| `{scenario}` | `{label(name)}` {_cells(row)}")
-    return "\n".join(rows)
+    header = (
+        "scenario", "filter", "NEES: all; last", "σ should be ×", "verdict", "lost", "RMSE, σ, m"
+    )  # fmt: skip
+    rows = []
+    for scenario, (name, row) in ((of, item) for of in scenarios for item in results[of].items()):
+        if label(name) in ("robocentric", "recommended"):
+            verdict = verdicts_of(row)["tally"]
+            rows.append(
+                (
+                    *(f"`{scenario}`", f"`{label(name)}`"),
+                    f"{_short(verdict['mean']['nees'])}; {_short(row['nees'][-1])}",
+                    *(_factor(verdict["mean"]), _decided(verdict)),
+                    f"{row['lost'] / row['runs']:.1%}",
+                    f"{row['rmse']:.3f}, {row['sigma']:.3f}",
+                )
+            )
+    return table(header, rows)
 
 
 def beside(results: Results) -> str:
     """The same numbers in short, a row for each scenario."""
-    columns = "`robocentric`: σ should be ×; lost | `recommended`: σ should be ×; lost; verdict"
-    rows = [f"| scenario | {columns} |", "|---|---|---|"]
+    rows = []
     for scenario, filters in results.items():
         of = {label(name): row for name, row in filters.items()}
         told = {name: verdicts_of(of[name])["tally"] for name in ("robocentric", "recommended")}
         cells = [
-            f"{_factor(verdict['mean'], 2)}; {of[name]['lost'] / of[name]['runs']:.1%}"
+            f"{_factor(verdict['mean'])}; {of[name]['lost'] / of[name]['runs']:.1%}"
             for name, verdict in told.items()
         ]
-        word, part = told["recommended"]["word"], told["recommended"]["of"]
-        decided = "" if part == "all steps" else f" ({part})"
-        rows.append(f"| `{scenario}` | {' | '.join(cells)}; {word}{decided} |")
-    return "\n".join(rows)
+        cells[-1] += f"; {_decided(told['recommended'])}"
+        rows.append((f"`{scenario}`", *cells))
+    columns = "`robocentric`: σ should be ×; lost", "`recommended`: σ should be ×; lost; verdict"
+    return table(("scenario", *columns), rows)
 
 
-def _cells(row: Row) -> str:
-    verdict = verdicts_of(row)["tally"]
-    mean = verdict["mean"]
-    decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
-    return (
-        f"| {_short(mean['nees'])}; {_short(row['nees'][-1])} | {_factor(mean, 2)} "
-        f"| {verdict['word']}{decided} | {row['lost'] / row['runs']:.1%} "
-        f"| {row['rmse']:.3f}, {row['sigma']:.3f} |"
-    )
-
-
-def _factor(found: dict[str, Any], digits: int = 3) -> str:
+def _factor(found: dict[str, Any]) -> str:
     factor, (low, high) = found["sigma_factor"], found["interval99"]
     if factor is None:
         return _short(factor)
-    told = "–" if high is None else f"{high:.{digits}f}"
-    return f"{factor:.{digits}f} [{low:.{digits}f}, {told}]"
+    return f"{factor:.2f} [{low:.2f}, {'–' if high is None else f'{high:.2f}'}]"
 
 
 def named(seeds: Iterable[int]) -> str:
@@ -364,29 +273,6 @@ def _short(value: float | None) -> str:
     if value is None or np.isnan(value):
         return "–"
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
-
-
-def read(path: Path) -> Results:
-    """The rows of this layout that a file holds; none where there is no file."""
-    found: Results = json.loads(path.read_text()) if path.exists() else {}
-    return {
-        scenario: {name: row for name, row in filters.items() if row.get("layout") == LAYOUT}
-        for scenario, filters in found.items()
-    }
-
-
-def add_to(path: Path, scenario: str, name: str, found: Row) -> None:
-    """Write the file, read anew as others add to it, with a seed more, unless it is there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    results = read(path)
-    filters = results.setdefault(scenario, {})
-    there = filters.get(name)
-    if there is None:
-        filters[name] = found
-    elif not set(found["seeds"]) & set(there["seeds"]):
-        filters[name] = together(there, found)
-    with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
 
 def missing(row: Row | None, options: Consistency) -> list[int]:

@@ -34,7 +34,6 @@ class Cost(Benchmark):
     """Times of a step."""
 
     scenario: str = "matched-loose"
-    """Built-in scenario."""
     filters: tuple[str, ...] = (
         "robocentric",
         "scale_gauge",
@@ -45,9 +44,7 @@ class Cost(Benchmark):
     )
     """Filters; times are relative to the first."""
     landmarks: str = "inverse_scaling"
-    """Landmark parametrization."""
     batch: int = 25
-    """Runs in one batch."""
     turns: int = 7
     """Timed calls of every filter."""
     out: Path = RESULTS / "cost.json"

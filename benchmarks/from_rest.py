@@ -11,7 +11,6 @@ there. `--figure` draws one run beside it, whose modes live long.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, table, write_table
-from modes import modes_of_run
-from modes_figure import plot_modes, worlds_of
+from benchmark import RESULTS, OfRuns, table
+from modes import modes_of_run, plot_modes, worlds_of
 
 import jaxslam
 from jaxslam.consistency import draw, filter_run
@@ -48,15 +46,11 @@ SETTLED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromRest(Benchmark):
+class FromRest(OfRuns):
     """Filters that are not told how the camera sets out."""
 
     scenarios: tuple[str, ...] = ("standstill", "standstill-6dof")
-    """Scenarios."""
     filters: tuple[str, ...] = ("robocentric", "scale_gauge+mixture9")
-    """Filters."""
-    runs: int = 200
-    """Runs."""
     seed: int = 101
     """One that nothing was chosen by."""
     chunk: int = 1
@@ -69,33 +63,19 @@ class FromRest(Benchmark):
         if self.figure:
             draw_figure(self)
             return
-        results = self.found()
-        for scenario, name in itertools.product(self.scenarios, self.filters):
-            there = results.setdefault(scenario, {}).get(name, {})
-            if (there.get("runs"), there.get("seed")) != (self.runs, self.seed):
-                results[scenario][name] = measure(self, scenario, name)
-                yield results
+        yield from self.each(self._measured, self.scenarios, self.filters)
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "from-rest.md", BEGIN, as_table(results))
-        write_table(self.docs / "from-rest.md", SAID, sentences(results))
+    def _measured(self, scenario: str, name: str) -> dict[str, Any]:
+        _, found = self.study(jaxslam.scenario(scenario), name)
+        return {
+            **{key: found[key] for key in KEYS},
+            "milliseconds_per_run": 1e3 * found["seconds"]["run"] / self.runs,
+            "compile": found["seconds"]["compile"],
+        }
 
-
-def measure(options: FromRest, scenario: str, name: str) -> dict[str, Any]:
-    """One filter in one scenario."""
-    world = jaxslam.scenario(scenario)
-    filters = jaxslam.make_filters(world, [name], ["inverse_scaling"])
-    study = jaxslam.monte_carlo(
-        world, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
-    )
-    ((_, found),) = jaxslam.summarise(study)["filters"].items()
-    return {
-        "runs": options.runs,
-        "seed": options.seed,
-        **{key: found[key] for key in KEYS},
-        "milliseconds_per_run": 1e3 * found["seconds"]["run"] / options.runs,
-        "compile": found["seconds"]["compile"],
-    }
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "from-rest.md", BEGIN, as_table(results)
+        yield "from-rest.md", SAID, sentences(results)
 
 
 def as_table(results: dict[str, dict[str, Any]]) -> str:

@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import tracks
-from benchmark import RESULTS, Benchmark, data_folder, table, write_table
+from benchmark import RESULTS, Case, OfRuns, data_folder, table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
@@ -53,7 +53,7 @@ RECORDS = ("log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Handheld(Benchmark):
+class Handheld(OfRuns):
     """Filters along trajectories and drives."""
 
     filters: tuple[str, ...] = ("world", "robocentric", "scale_gauge+scene50+mixture9")
@@ -64,47 +64,34 @@ class Handheld(Benchmark):
     """Names of trajectories; all of the data folder by default."""
     drives: tuple[str, ...] = ()
     """Names of drives with tracks; all of the data folder by default."""
-    runs: int = 200
-    """Simulated runs along every trajectory."""
     steps: int = 150
-    """Of a simulated run."""
     starts: int = 20
     """Windows of every drive."""
     frames: int = 100
     """Steps of a window of a drive."""
-    seed: int = 0
-    """Of the simulated runs."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "handheld.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one filter at a time."""
-        results = self.found()
-        for where, name, wanted, measure in _studies(self):
-            found = results.setdefault(where, {}).get(name)
-            if not found or any(found.get(key) != value for key, value in wanted.items()):
-                results[where][name] = {**wanted, **measure()}
-                print(f"{name}: {' | '.join(_row(where, results[where][name]))}", flush=True)
-                yield results
+        yield from self.added(_studies(self))
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "handheld.md", MARK, as_table(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "handheld.md", MARK, as_table(results)
 
 
-def _studies(options: Handheld) -> Iterator[tuple[str, str, dict[str, int], Any]]:
-    """Of what, by which filter, of how many runs, and the function that measures it."""
+def _studies(options: Handheld) -> Iterator[Case]:
+    """Along every trajectory and on every drive, each filter."""
     simulated = {"runs": options.runs, "steps": options.steps, "seed": options.seed}
     recorded = {"runs": options.starts, "steps": options.frames}
     data = data_folder()  # where scenarios find them too
     for trajectory in options.trajectories or _known("trajectories/*.txt", "kitti_format"):
-        chosen = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
-        for name, slam in _filters(chosen, options).items():
-            yield chosen.name, name, simulated, partial(_simulated, chosen, name, slam, options)
+        world = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
+        for name, slam in _filters(world, options).items():
+            yield (world.name, name), simulated, partial(_simulated, world, name, slam, options)
     for drive in options.drives or _known("kitti_tracks/*/tracks.npz"):
         drove = tracks.read(data / "kitti_tracks" / drive)
         for name, slam in _filters(on_the_road(drove), options).items():
-            yield f"tracks-{drive}", name, recorded, partial(_recorded, drove, slam, options)
+            yield (f"tracks-{drive}", name), recorded, partial(_recorded, drove, slam, options)
 
 
 def _known(pattern: str, without: str = " ") -> list[str]:
@@ -176,8 +163,7 @@ def numbers(records: dict[str, np.ndarray]) -> dict[str, Any]:
     one = one_scale_of(records)
     whole = {**records, "nees": one.nees, "drift": one.drift, "normalised": one.normalised}
     part = {key: np.asarray(values)[:, np.array(at) - 1] for key, values in whole.items()}
-    nees, error, sigma = (part[key] for key in ("nees", "log_scale", "log_scale_sigma"))
-    finite, own = np.isfinite(nees), part["beyond_scale"]
+    nees, finite = part["nees"], np.isfinite(part["nees"])
 
     def mean(values: np.ndarray) -> list[float | None]:
         counted = finite & np.isfinite(values)
@@ -190,30 +176,19 @@ def numbers(records: dict[str, np.ndarray]) -> dict[str, Any]:
 
     with np.errstate(invalid="ignore"):
         lost = ~(nees <= lost_threshold(DOF))
-        normalised = (error / sigma) ** 2
+        normalised = (part["log_scale"] / part["log_scale_sigma"]) ** 2
         nis = np.nansum(records["nis"]) / np.nansum(records["nis_dof"])
     return {
         "at": at,
         "one_scale": mean(nees / DOF),
         "one_scale_median": _for_json(np.median(np.where(finite, nees, np.inf), axis=0) / DOF),
-        "own_scale_median": _for_json(np.median(np.where(finite, own, np.inf), axis=0) / (DOF - 1)),
         "drift_rms": root(part["drift"] ** 2),
         "drift_normalised": root(part["normalised"]),
-        "drift_normalised_median": _middle(np.sqrt(part["normalised"])),
         "lost": lost.mean(axis=0).tolist(),
-        "log_scale_rms": root(error**2),
-        "log_scale_median": _for_json(np.median(np.where(finite, np.abs(error), np.inf), axis=0)),
-        "log_scale_sigma": _for_json(np.median(np.where(finite, sigma, np.inf), axis=0)),
         "log_scale_normalised": root(normalised),
         "reversed": mean(part["reversed"]),
         "nis": _for_json(np.array([nis]))[0],
     }
-
-
-def _middle(values: np.ndarray) -> list[float | None]:
-    """Medians of what is there."""
-    columns = [column[np.isfinite(column)] for column in values.T]
-    return [float(np.median(column)) if column.size else None for column in columns]
 
 
 def _for_json(values: np.ndarray) -> list[float | None]:

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, OfRuns, by_batch
 
 import jaxslam
 from jaxslam.consistency import draw, run_through
@@ -28,12 +27,10 @@ from jaxslam.statistics.bands import chi2_quantile, normalised_squared
 RECIPE = {"depth_range": [5.0, 7.0], "inverse_depth": [0.1682, 0.0164], "landmarks": 30}
 """With the mean and σ of 1/z of points that are uniform between 5 and 7 m."""
 PARTS = {"orientation": slice(3, 6), "position": slice(0, 3)}
-TOLD = "first", "last", "end"
-"""Spans of a run: two thirds, and the last second."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inertial(Benchmark):
+class Inertial(OfRuns):
     """Filters along recorded trajectories."""
 
     trajectories: tuple[str, ...] = ("udel_gore", "tum_corridor1")
@@ -43,27 +40,14 @@ class Inertial(Benchmark):
     )  # fmt: skip
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 100
-    """Runs of each."""
     steps: int = 1600
-    """Frames of every run."""
     seed: int = 20261128
-    """Seed of the runs."""
-    chunk: int = 25
-    """Runs in one batch."""
     out: Path = RESULTS / "inertial.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[trajectory][filter]`: NEES per degree of freedom of orientation and position, of every
         third and of the last second, and the share of lost runs."""
-        results = self.found()
-        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        for trajectory in self.trajectories:
-            for name in self.filters:
-                row = results.setdefault(trajectory, {}).get(name, {})
-                if any(row.get(key) != value for key, value in wanted.items()):
-                    found = self._measured(trajectory, name)
-                    results[trajectory][name] = wanted | found
-                    yield results
+        yield from self.each(self._measured, self.trajectories, self.filters, steps=self.steps)
 
     def _measured(self, trajectory: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario("imu", RECIPE, trajectory=trajectory, sway=[], steps=self.steps)
@@ -82,21 +66,6 @@ class Inertial(Benchmark):
             found[part]["rmse"] = float(np.sqrt(np.mean(errors[:, -1, index])))
         lost = np.any(nees[:, -1] > chi2_quantile(0.9999, 3), axis=1)
         return found | {"lost": float(np.mean(lost))}
-
-    def report(self, results: dict[str, Any]) -> None:
-        for trajectory, filters in results.items():
-            rows = [[name, *_cells(row)] for name, row in filters.items()]
-            header = [f"{part}, {of}" for part in PARTS for of in (*TOLD, "rms")]
-            print(trajectory, table(["filter", *header, "lost"], rows), sep="\n", flush=True)
-
-
-def _cells(row: dict[str, Any]) -> Iterator[str]:
-    for part in PARTS:
-        for of in TOLD:
-            mean, low, high = map(number, row[part][of])
-            yield f"{mean} [{low}, {high}]"
-        yield number(row[part]["rmse"], ".4f")
-    yield f"{100 * row['lost']:.1f} %"
 
 
 def _interval95(by_run: np.ndarray) -> list[float]:
@@ -117,14 +86,9 @@ def _of_runs(slam, world, options: Inertial) -> tuple[np.ndarray, np.ndarray]:
         return [(normalised_squared(e, covariance[part, part]), e @ e) for e, part in errors]
 
     room, runs = draw(world, options.runs, seed=options.seed)
-    one = partial(run_through, slam, room, output=told)
-    batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
-    parts = [
-        jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))
-        for i in range(0, options.runs, options.chunk)
-    ]
-    runs_first = [np.moveaxis(np.array(part), (0, 1), (-2, -1)) for part in parts]
-    whole = np.concatenate(runs_first, axis=0)
+    batch = jax.jit(jax.vmap(lambda run: run_through(slam, room, run, told)[1]))
+    # Of two parts, each NEES and error: runs, steps, part.
+    whole = np.moveaxis(np.array(by_batch(batch, runs, options.chunk)), (0, 1), (-2, -1))
     return whole[..., 0], whole[..., 1]
 
 

@@ -1,11 +1,10 @@
-"""What a delayed initialisation costs: consistency, bias of depth, information, frames of delay.
+"""What a delayed initialisation costs: consistency, bias of depth, frames of delay.
 
     python benchmarks/initialisation.py --runs 200
 
-Runs undelayed and delayed filters on the same worlds, prints a table, and writes one JSON file;
-scenarios that are in the file and are not measured again stay there.
-`near` is the world of `matched` with points 0.5–5 m away, the range of MonoSLAM's particles, and
-a camera at 0.4 m/s; in the others points lie beyond it.
+Runs undelayed and delayed filters on the same worlds; scenarios that are in the file and are not
+measured again stay there. `near` is the world of `matched` with points 0.5–5 m away, the range of
+MonoSLAM's particles, and a camera at 0.4 m/s; in the others points lie beyond it.
 """
 
 from __future__ import annotations
@@ -19,16 +18,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, OfRuns, by_batch
 from jaxtyping import Array, Bool
 
 import jaxslam
-from jaxslam.consistency.montecarlo import draw
+from jaxslam.consistency import draw, run_through
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.filters.rivals.depth_particles import DepthParticles
 from jaxslam.filters.rivals.rays import RaySum
-from jaxslam.linalg import cholesky
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features
 from jaxslam.statistics.bands import lost_threshold, normalised_squared
@@ -37,7 +35,7 @@ NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Initialisation(Benchmark):
+class Initialisation(OfRuns):
     """Undelayed and delayed filters in the same worlds."""
 
     scenarios: tuple[str, ...] = ("near", "matched", "circle")
@@ -51,15 +49,10 @@ class Initialisation(Benchmark):
         "robocentric+particles30/cartesian",
         "robocentric+rays/cartesian",
     )
-    """Filters with their landmarks. Information is compared with the first one's."""
-    runs: int = 200
-    """Runs of every filter."""
-    seed: int = 0
-    """Run i draws from this seed and i alone."""
+    """Filters with their landmarks."""
     steps: int | None = None
     """Filter steps; the scenario's by default."""
     chunk: int = 50
-    """Runs in one batch."""
     out: Path = RESULTS / "initialisation.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
@@ -71,14 +64,6 @@ class Initialisation(Benchmark):
                 filters[pair] = numbers
                 yield results
 
-    def report(self, results: dict[str, Any]) -> None:
-        rows = [
-            (name, pair, *_cells(f))
-            for name, of in results.items()
-            for pair, f in of["filters"].items()
-        ]
-        print(table(HEADER, rows), flush=True)
-
 
 def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     """All filters of one scenario."""
@@ -86,39 +71,29 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     base, fields = ("matched", {**NEAR, **fields}) if world == "near" else (world, fields)
     scenario = jaxslam.scenario(base, fields)
     room, runs = draw(scenario, options.runs, seed=options.seed)
-    sensor, reference = scenario.sensor, None
     for pair in options.filters:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]
-        run = jax.jit(jax.vmap(partial(filter_run, slam, room, sensor)))
-        records = _concatenated(run(part) for part in _parts(runs, options.chunk))
-        if reference is None:
-            reference = records["information"]
-        yield pair, summarise(records, reference)
+        run = jax.jit(jax.vmap(partial(filter_run, slam, room, scenario.sensor)))
+        yield pair, summarise(by_batch(run, runs, options.chunk))
 
 
 def filter_run(slam: AbstractFilter, room: Room, sensor: AbstractSensor, run: Run) -> dict:
     """One filter on one run: records of every step, and its landmarks at the last."""
-    first, seen, new = features(run, room)
-    state = slam.init(room.capacity, first)
-    settled = partial(initialised, slam)
 
-    def step(state, frame):
-        seen, new, control, T_BC = frame
-        state, _ = slam.step(state, control, seen, new)
+    def told(state, innovation, frame):
         estimate, covariance = camera_pose(slam, state)
-        missed = estimate.translation() - T_BC.translation()
-        return state, {
-            "nees": normalised_squared(*slam.pose_error(state, T_BC)),
+        missed = estimate.translation() - frame.pose.translation()
+        return {
+            "nees": normalised_squared(*slam.pose_error(state, frame.pose)),
             "squared_error": missed @ missed,
             "variance": jnp.trace(covariance[: missed.size, : missed.size]),
-            "information": -cholesky(covariance).log_det(),
-            "settled": settled(state),
+            "settled": initialised(slam, state),
         }
 
-    later = jax.tree.map(lambda x: x[1:], run.poses)
-    last, records = jax.lax.scan(step, state, (seen, new, run.controls, later))
-    records["settled"] = jnp.concatenate([settled(state)[None], records["settled"]])
+    last, records = run_through(slam, room, run, told)
+    begun = initialised(slam, slam.init(room.capacity, features(run, room)[0]))
+    records["settled"] = jnp.concatenate([begun[None], records["settled"]])
     return records | _landmarks(slam, room.landmarks, sensor, run, last)
 
 
@@ -132,109 +107,50 @@ def initialised(slam: AbstractFilter, state: Any) -> Bool[Array, " landmarks"]:
 
 
 def _landmarks(slam, count, sensor, run, state) -> dict:
-    """Of every landmark: when and how far away it was first seen, and what became of it."""
+    """Of every landmark: when it was first seen, and what became of it."""
     visible = run.visible[:, :count]
     first = jnp.argmax(visible, axis=0)
-    positions = run.poses.translation()
     T_CB = jax.tree.map(lambda x: x[-1], run.poses).inverse()
-    points = run.points[:count]
-    slots = jnp.arange(count)
-    chart, covariance = landmarks_in_camera(slam, state, slots, sensor)
-    truth = 1 / jax.vmap(T_CB.apply)(points)[:, -1]
+    chart, covariance = landmarks_in_camera(slam, state, jnp.arange(count), sensor)
+    truth = 1 / jax.vmap(T_CB.apply)(run.points[:count])[:, -1]
     return {
         "begun": jnp.any(visible, axis=0),
         "first": first,
-        "distance": jnp.linalg.norm(points - positions[first], axis=1),
         "in_map": slam.in_map(state),
         "seen_last": visible[-1] & (first < visible.shape[0] - 1),
         "normalised": (chart[:, -1] - truth) / jnp.sqrt(covariance[:, -1, -1]),
     }
 
 
-def summarise(records: dict, reference: np.ndarray) -> dict:
-    """Numbers of one filter: over all runs but those whose NEES is not finite, which are lost."""
+def summarise(records: dict) -> dict:
+    """Numbers of one filter: over all runs but those whose NEES is not finite, which are lost.
+
+    Of landmarks the shares of those begun, and the error of 1/z over σ of those that are settled
+    and seen at the end.
+    """
     healthy = np.isfinite(records["nees"]).all(axis=1)
     good = {key: value[healthy] for key, value in records.items()}
-    nees, dof = good["nees"][:, -1], 3
-    settled, begun = good["settled"], good["begun"]
+    nees, settled, begun = good["nees"][:, -1], good["settled"], good["begun"]
     ever = settled.any(axis=1) & begun
     delays = (np.argmax(settled, axis=1) - good["first"])[ever]
-    known = settled[:, -1] & good["in_map"] & good["seen_last"]
-    steps = good["information"].shape[1]
-    # Half of log det P a dimension: how much larger σ is than the reference's.
-    ratio = np.exp((reference[healthy] - good["information"]).mean(axis=0) / (2 * dof))
+    known = settled[:, -1] & good["in_map"] & good["seen_last"] & begun
+    errors = good["normalised"][known]
     return {
         "nees": float(nees.mean()),
         "nees_median": float(np.median(nees)),
-        "lost": float(1 - np.sum(nees <= lost_threshold(dof)) / healthy.size),
+        "lost": float(1 - np.sum(nees <= lost_threshold(3)) / healthy.size),
         "diverged": int(np.sum(~healthy)),
         "rmse": float(np.sqrt(good["squared_error"][:, -1].mean())),
         "sigma": float(np.sqrt(good["variance"][:, -1].mean())),
-        "sigma_ratio_third": float(ratio[steps // 3 - 1]),
-        "sigma_ratio_end": float(ratio[-1]),
         "delay_mean": float(delays.mean()) if delays.size else None,
-        "delay_median": float(np.median(delays)) if delays.size else None,
         "landmarks": {
-            name: _landmark_numbers(good, known, ever, begun & which)
-            for name, which in _by_distance(good["distance"]).items()
+            "all": {
+                "settled": float(ever[begun].mean()),
+                "dropped": float((~good["in_map"])[begun].mean()),
+                "bias": float(errors.mean()) if errors.size else None,
+            }
         },
     }
-
-
-def _by_distance(distance: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        "all": np.ones_like(distance, bool),
-        "within 5 m": distance <= 5,
-        "5-30 m": (distance > 5) & (distance <= 30),
-        "beyond 30 m": distance > 30,
-    }
-
-
-def _landmark_numbers(good: dict, known, ever, which) -> dict | None:
-    """Shares of the landmarks begun; error of 1/z over σ of those settled and seen at the end."""
-    count = int(which.sum())
-    if not count:
-        return None
-    errors = good["normalised"][known & which]
-    return {
-        "count": count,
-        "settled": float(ever[which].mean()),
-        "dropped": float((~good["in_map"])[which].mean()),
-        "compared": int(errors.size),
-        "bias": float(errors.mean()) if errors.size else None,
-        "bias_median": float(np.median(errors)) if errors.size else None,
-        "spread": float(np.sqrt((errors**2).mean())) if errors.size else None,
-    }
-
-
-def _parts(runs: Run, size: int) -> Iterator[Run]:
-    for start in range(0, runs.visible.shape[0], size):
-        yield jax.tree.map(lambda x, s=start: x[s : s + size], runs)
-
-
-def _concatenated(parts: Iterator[dict]) -> dict[str, np.ndarray]:
-    fetched = [jax.device_get(part) for part in parts]
-    return {key: np.concatenate([part[key] for part in fetched]) for key in fetched[0]}
-
-
-HEADER = (
-    "scenario", "filter/landmarks", "NEES", "median", "lost", "RMSE m", "σ m", "σ/σ₀ ⅓", "end",
-    "delay", "settled", "dropped", "bias/σ", "rms/σ",
-)  # fmt: skip
-
-
-def _cells(f: dict[str, Any]) -> tuple[str, ...]:
-    landmarks = f["landmarks"]["all"]
-    return (
-        number(f["nees"], ".3g"),
-        number(f["nees_median"]),
-        f"{f['lost']:.1%}",
-        *(number(f[key], ".3f") for key in ("rmse", "sigma")),
-        *(number(f[key]) for key in ("sigma_ratio_third", "sigma_ratio_end")),
-        number(f["delay_mean"], ".1f"),
-        *(f"{landmarks[key]:.1%}" for key in ("settled", "dropped")),
-        *(number(landmarks[key]) for key in ("bias", "spread")),
-    )
 
 
 if __name__ == "__main__":

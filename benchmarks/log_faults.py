@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table
+from benchmark import RESULTS, Benchmark
 from scipy.spatial.transform import Rotation
 from verdicts import correlated, displaced
 
@@ -254,25 +254,6 @@ class LogFaults(Benchmark):
             ]
             yield {"rows": rows}
 
-    def report(self, results: dict[str, Any]) -> None:
-        print(as_table(results), flush=True)
-
-
-def as_table(results: dict[str, Any]) -> str:
-    """The shares of logs by fault and factor."""
-    lines = []
-    for row in results["rows"]:
-        said, logs = Counter(row["said"]), row["logs"]
-        false = sum(count for word, count in said.items() if word.startswith("false"))
-        shares = (said["named"], said["over-confident"], false)
-        rest = logs - sum(shares)
-        told = (f"{x / logs:.0%}" for x in (*shares, rest))
-        lines.append((row["fault"], row["factor"], logs, *told))
-    header = (
-        "fault", "σ too small by", "logs", "named", "over-confident", "another cause", "neither"
-    )  # fmt: skip
-    return table(header, lines)
-
 
 if __name__ == "__main__":
-    run_one(LogFaults)
+    LogFaults.run()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark
+from benchmark import RESULTS, OfRuns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -38,48 +38,31 @@ IDEAL = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class LongRuns(Benchmark):
+class LongRuns(OfRuns):
     """Filters in long runs."""
 
     scenarios: tuple[str, ...] = tuple(WORLDS)
-    """Scenarios."""
     filters: tuple[str, ...] = ("robocentric", "world+oc", "scale_gauge+oc+scene50", "recommended")
     """Filters, with modifiers, of Inverse Scaling."""
     runs: int = 48
-    """Runs of each."""
     steps: int = 3000
-    """Steps of every run."""
     seed: int = 20261128
-    """Seed of the runs."""
     chunk: int = 24
-    """Runs in one batch."""
     out: Path = RESULTS / "long_runs.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[scenario][filter]`: mean and median NEES and the share of lost runs `at` some steps."""
-        results = self.found()
-        wanted = {"runs": self.runs, "steps": self.steps, "seed": self.seed}
-        for scenario in self.scenarios:
-            for name in self.filters:
-                row = results.setdefault(scenario, {}).get(name, {})
-                if any(row.get(key) != value for key, value in wanted.items()):
-                    results[scenario][name] = wanted | self._measured(scenario, name)
-                    yield results
+        yield from self.each(self._measured, self.scenarios, self.filters, steps=self.steps)
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
         world = jaxslam.scenario(scenario, {"steps": self.steps})
-        study = jaxslam.monte_carlo(world, [name], runs=self.runs, seed=self.seed, chunk=self.chunk)
-        (found,) = jaxslam.summarise(study)["filters"].values()
+        _, found = self.study(world, name)
         at = np.unique(np.geomspace(FIRST, self.steps, MOST).round().astype(int)).tolist()
         kept = {key: [found[key][k - 1] for k in at] for key in ("nees", "nees_median", "lost")}
         seconds = found["seconds"]["run"]
         return {"at": at, **kept, "microseconds_per_step": 1e6 * seconds / self.runs / self.steps}
 
     def report(self, results: dict[str, Any]) -> None:
-        for scenario, filters in results.items():
-            for name, row in filters.items():
-                told = [row[key][-1] for key in ("nees", "nees_median", "lost")]
-                print(scenario, name, *told, flush=True)
         save(drawn_of(results), self.docs / "long-runs.png")
 
 

@@ -1,6 +1,6 @@
 """What the tests are worth: faults of one line each, put into the package, and who notices.
 
-    python -m benchmarks.mutants --out benchmarks/results/mutants.json
+    python benchmarks/mutants.py
 
 A mutant is the package with one operator, sign, transpose, bound, constant or term changed, drawn
 with a seed over all rooms by their size. The tests of its room are run first, then the others,
@@ -10,20 +10,18 @@ until one fails: the mutant is caught; else it has survived. An hour or two, on 
 from __future__ import annotations
 
 import ast
-import json
 import os
 import random
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import tyro
+from benchmark import RESULTS, Benchmark
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "jaxslam"
@@ -60,7 +58,9 @@ def sites(source: str, path: str) -> Iterator[Site]:
 
 def _executed(node: ast.AST) -> Iterator[ast.AST]:
     """All nodes but annotations, docstrings, messages, and imports."""
-    if isinstance(node, UNSEEN) or _is_text(node):
+    if isinstance(node, UNSEEN) or (
+        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    ):
         return
     yield node
     for name, value in ast.iter_fields(node):
@@ -69,10 +69,6 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
                 yield from _executed(child)
-
-
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _mutated(node: ast.expr) -> Iterator[tuple[str, str]]:
@@ -158,30 +154,26 @@ def outcome(site: Site, tree: Path, options: list[str], minutes: float) -> str:
     source = path.read_text()
     path.write_text(applied(site, source))
     room = _room(site.path).lstrip("_")
-    own = [f"tests/{x}" for x in (room, f"test_{room}.py", "laws")]
-    own = [path for path in own if (tree / path).exists()]
+    own = [f"tests/{x}" for x in (room, f"test_{room}.py", "laws") if (tree / "tests" / x).exists()]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *options]
     try:
         for where in (own, ["tests"]):
-            command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-            try:
-                done = subprocess.run(
-                    [*command, *options, *where], cwd=tree, capture_output=True, text=True,
-                    timeout=60 * minutes, env={**os.environ, "PYTHONPATH": str(tree)},
-                )  # fmt: skip
-            except subprocess.TimeoutExpired:
-                return "it did not end"
+            done = subprocess.run(
+                [*command, *where], cwd=tree, capture_output=True, text=True,
+                timeout=60 * minutes, env={**os.environ, "PYTHONPATH": str(tree)},
+            )  # fmt: skip
             if done.returncode not in (0, 5):
                 failed = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
-                return (
-                    failed[0].split(" - ")[0] if failed else f"pytest ended with {done.returncode}"
-                )
-        return "survived"
+                return [*failed, f"pytest ended with {done.returncode}"][0].split(" - ")[0]
+    except subprocess.TimeoutExpired:
+        return "it did not end"
     finally:
         path.write_text(source)
+    return "survived"
 
 
-@dataclass(frozen=True)
-class Mutants:
+@dataclass(frozen=True, kw_only=True)
+class Mutants(Benchmark):
     """How many mutants, and the tests that they are shown."""
 
     count: int = 60
@@ -192,31 +184,27 @@ class Mutants:
     """After which a run of tests is taken not to end."""
     only: tuple[int, ...] = ()
     """Numbers of mutants, to run these alone."""
-    out: Path = ROOT / "benchmarks" / "results" / "mutants.json"
+    out: Path = RESULTS / "mutants.json"
 
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """Who noticed each mutant, after every one."""
+        marks, found = ["-m", ""] if self.suite == "whole" else [], []
+        ignored = shutil.ignore_patterns(".git", "__pycache__", ".*cache")
+        with tempfile.TemporaryDirectory() as folder:
+            tree = Path(folder) / "tree"
+            shutil.copytree(ROOT, tree, ignore=ignored)
+            for number, site in enumerate(drawn(self.count, self.seed)):
+                if not self.only or number in self.only:
+                    noticed = outcome(site, tree, marks, self.minutes)
+                    found.append({"number": number, **site._asdict(), "caught_by": noticed})
+                    survived = [x["number"] for x in found if x["caught_by"] == "survived"]
+                    of = {"suite": self.suite, "seed": self.seed, "mutants": len(found)}
+                    yield {**of, "survived": survived, "each": found}
 
-def main(options: Mutants) -> None:
-    """Run the tests on every mutant; results are written after each."""
-    chosen, found = drawn(options.count, options.seed), []
-    with tempfile.TemporaryDirectory() as folder:
-        tree = Path(folder) / "tree"
-        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".git", "__pycache__", ".*cache"))
-        for number, site in enumerate(chosen):
-            if options.only and number not in options.only:
-                continue
-            marks = ["-m", ""] if options.suite == "whole" else []
-            noticed = outcome(site, tree, marks, options.minutes)
-            found.append({"number": number, **site._asdict(), "caught_by": noticed})
-            told = f"{number:3} {site.path}:{site.line} {site.kind}: {site.text}: {noticed}"
-            print(told, flush=True)
-            survived = [x["number"] for x in found if x["caught_by"] == "survived"]
-            result = {
-                "suite": options.suite, "seed": options.seed, "mutants": len(found),
-                "caught": len(found) - len(survived), "survived": survived,
-                "kinds": dict(Counter(x["kind"] for x in found)), "each": found,
-            }  # fmt: skip
-            options.out.write_text(json.dumps(result, indent=1) + "\n")
+    def report(self, results: dict[str, Any]) -> None:
+        last = results["each"][-1]
+        print(*(last[x] for x in ("number", "path", "line", "kind", "text", "caught_by")))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Mutants, description=__doc__))
+    Mutants.run()

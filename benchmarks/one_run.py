@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, table
 from scipy.signal import lfilter
 
 from jaxslam.statistics import run_verdict
@@ -211,8 +211,8 @@ class OneRunStudy(Benchmark):
                 print(results["wrong"][-1], flush=True)
                 yield results
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "one-run.md", BEGIN, as_table(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "one-run.md", BEGIN, as_table(results)
 
 
 def counted(
@@ -274,4 +274,4 @@ def largest(rows: list[dict[str, Any]], test: str) -> float:
 
 
 if __name__ == "__main__":
-    run_one(OneRunStudy)
+    OneRunStudy.run()

@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmark import RESULTS, write_page
 from consistency import label, verdicts_of
+from sequences import LANDMARKS, ON_VIDEO
 
 MARK = re.compile(r"<!-- =(.+?) -->", re.DOTALL)
 WORDS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
@@ -52,11 +53,6 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         """At the last step: NEES, the share of lost runs, and NEES of the others."""
         one = row(scenario, name)
         return [one["nees"][-1], lost(scenario, name), one["nees_not_lost"]]
-
-    def step(scenario: str, name: str) -> float:
-        """The time of a step relative to that of `robocentric` in the same scenario."""
-        own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
-        return own / paper
 
     def theirs(study: str, name: str) -> list[float]:
         """Our values beside those of a published table, quantity by quantity."""
@@ -95,6 +91,23 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         found = {name: next(iter(x.values())) for name, x in files["handheld"].items()}
         return sorted(x[key][-1] for name, x in found.items() if name.startswith("handheld"))
 
+    def believed(name: str = ON_VIDEO, video: str = "synthetic") -> dict[str, list[float]]:
+        """What the tracker believes on videos of which the names begin so, NEES and drift sorted:
+        the drift itself, and in its σ."""
+        found = [
+            filters[f"{name}/{LANDMARKS}"]["belief"]
+            for key, filters in files["sequences"].items()
+            if key.startswith(video)
+        ]
+        drifts = zip(*(x["drift"] for x in found), strict=True)
+        itself, normalised = (sorted(x) for x in drifts)
+        return {"nees": sorted(x["nees"] for x in found), "drift": itself, "of_sigma": normalised}
+
+    def filmed(key: str) -> list[float]:
+        """A number of all rendered videos that have it, sorted."""
+        videos = (x for seeds in files["rendered"].values() for x in seeds.values())
+        return sorted(x[key] for x in videos if key in x)
+
     def accused(test: str = "verdict", *without: str) -> float:
         """The largest share of right filters that a test of one run calls over-confident."""
         rows = (row for row in files["one_run"]["right"] if row["name"] not in without)
@@ -116,8 +129,8 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         return found["microseconds_per_step"]
 
     functions = (
-        row, mean, sigma, lost, end, step, theirs, told, along, observed, initialised, walked,
-        accused, cautious, shown, on_gpu,
+        row, mean, sigma, lost, end, theirs, told, along, observed, initialised, walked,
+        believed, filmed, accused, cautious, shown, on_gpu,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, run_one, table
 from published_worlds import localisation, make, zhang
 from tyro.conf import Positional
 
@@ -38,6 +38,9 @@ from jaxslam.statistics.bands import normalised_squared
 MARK = "<!-- published.py -->"
 RESAMPLED = 4000
 """Samples of runs of which an interval is made."""
+
+
+Published = tuple[float | None, ...] | None
 
 
 class Quantity(NamedTuple):
@@ -69,7 +72,7 @@ class Study:
     runs: int
     """Ours."""
     quantities: tuple[Quantity, ...]
-    theirs: dict[str, tuple[float | None, ...] | None]
+    theirs: dict[str, Published]
     """By filter the value of every quantity; None where only ours exists."""
     every: int = 1
     """Measurements are in one frame of so many, the first of which is the start."""
@@ -128,32 +131,46 @@ ZHANG = (
     Quantity("NEES of orientation", "orientation"),
     Quantity("NEES of pose", "pose"),
 )
-BESIDE = dict.fromkeys(
-    ("robocentric/cartesian", "world+oc/cartesian", "world+fej2/cartesian",
-     "world+decoupled/cartesian")
-)  # fmt: skip
 SLAMTB, HUANG = "slamtb (Solà)", "Barrau, Bonnabel 2015; Huang et al. 2010"
 RAL, SONG = "Zhang et al. 2017", "Song et al. 2024"
-AFFINE_FILTERS = dict.fromkeys(
-    f"{name}/cartesian"
-    for name in ("world", "world+fej", "world+fej2", "world+oc", "invariant", "world+decoupled",
-                 "robocentric")
-)  # fmt: skip
 
 
-def affine(odometry: float, position: float) -> World:
+SPELT = {
+    "oc": "world+oc", "fej": "world+fej", "fej2": "world+fej2", "decoupled": "world+decoupled",
+    "left": "left-invariant", "composed": "robocentric, composed first",
+}  # fmt: skip
+
+
+def cartesian(**theirs: Published) -> dict[str, Published]:
+    """Rows of filters of Cartesian points, by names that `SPELT` makes those of filters."""
+    return {f"{SPELT.get(name, name)}/cartesian": values for name, values in theirs.items()}
+
+
+def positions(of: str, /, **theirs: Published) -> Study:
+    """A table of Barrau and Bonnabel, and filters that it has not."""
+    beside = cartesian(fej=None, fej2=None, decoupled=None)
+    return Study(HUANG, partial(scenario, of), 100, 300, POSITIONS, cartesian(**theirs) | beside)
+
+
+def zhang_of(share: float, /, **theirs: Published) -> Study:
+    """A table of Zhang et al., and filters that it has not."""
+    beside = cartesian(robocentric=None, oc=None, fej2=None, decoupled=None)
+    world = partial(zhang, share)
+    return Study(RAL, world, 100, 8, ZHANG, cartesian(**theirs) | beside, batch=None)
+
+
+def affine(odometry: float, position: float) -> Study:
     """The circle of Song et al. with another σ of translation and of a measured position."""
     sigma = (odometry,) * 3 + (0.003,) * 3
-    return scenario("positions", {**AFFINE, "odometry_sigma": sigma, "position_sigma": position})
+    fields = {**AFFINE, "odometry_sigma": sigma, "position_sigma": position}
+    names = ("world", "fej", "fej2", "oc", "invariant", "decoupled", "robocentric")
+    filters = cartesian(**dict.fromkeys(names))
+    return Study(SONG, partial(scenario, "positions", fields), 50, 50, ZHANG[2:], filters)
 
 
 STUDIES = {
     "room": Study(
-        SLAMTB,
-        partial(scenario, "room"),
-        25,
-        100,
-        ROOM,
+        SLAMTB, partial(scenario, "room"), 25, 100, ROOM,
         {
             "world/inverse_depth": (6.99, 6.57, 6.88, 0.082),
             "world/anchored_homogeneous": (7.00, 6.54, 6.83, 0.082),
@@ -163,95 +180,34 @@ STUDIES = {
             "robocentric/inverse_scaling": None,
         },
     ),
-    "positions": Study(
-        HUANG,
-        partial(scenario, "positions"),
-        100,
-        300,
-        POSITIONS,
-        {
-            "world/cartesian": (4.77, 6.35),
-            "robocentric/cartesian": (3.09, 3.37),
-            "world+oc/cartesian": (3.10, 3.35),
-            "invariant/cartesian": (3.10, 3.33),
-            "world+fej/cartesian": None,
-            "world+fej2/cartesian": None,
-            "world+decoupled/cartesian": None,
-        },
+    "positions": positions(
+        "positions", world=(4.77, 6.35), robocentric=(3.09, 3.37), oc=(3.10, 3.35),
+        invariant=(3.10, 3.33),
     ),
-    "positions-loose": Study(
-        HUANG,
-        partial(scenario, "positions-loose"),
-        100,
-        300,
-        POSITIONS,
-        {
-            "world/cartesian": (19.1, 29.9),
-            "robocentric/cartesian": (5.11, 6.91),
-            "world+oc/cartesian": (5.21, 7.02),
-            "invariant/cartesian": (5.01, 6.62),
-            "world+fej/cartesian": None,
-            "world+fej2/cartesian": None,
-            "world+decoupled/cartesian": None,
-        },
+    "positions-loose": positions(
+        "positions-loose", world=(19.1, 29.9), robocentric=(5.11, 6.91), oc=(5.21, 7.02),
+        invariant=(5.01, 6.62),
     ),
     "ukfm-slam2d": Study(
-        "ukfm (Brossard)",
-        partial(scenario, "positions", UKFM),
-        100,
-        200,
-        of_parts(10),
-        {
-            "world/cartesian": (2.88, 2.56, 3.02, 0.67),
-            "invariant/cartesian": (1.01, 1.17, 2.51, 0.55),
-        },
+        "ukfm (Brossard)", partial(scenario, "positions", UKFM), 100, 200, of_parts(10),
+        cartesian(world=(2.88, 2.56, 3.02, 0.67), invariant=(1.01, 1.17, 2.51, 0.55)),
     ),
     "ukfm-localisation": Study(
-        "ukfm (Brossard)",
-        localisation,
-        100,
-        400,
-        of_parts(2000),
-        {
-            "world/cartesian": (4.91, 275.28, 12.00, 0.76),
-            "left-invariant/cartesian": (1.00, 2.02, 11.35, 0.45),
-        },
-        every=100,
+        "ukfm (Brossard)", localisation, 100, 400, of_parts(2000),
+        cartesian(world=(4.91, 275.28, 12.00, 0.76), left=(1.00, 2.02, 11.35, 0.45)), every=100,
     ),
-    "zhang-1": Study(
-        RAL,
-        partial(zhang, 0.01),
-        100,
-        8,
-        ZHANG,
-        {
-            "invariant/cartesian": (0.25, 0.0058, 1.02, 1.01),
-            "world+fej/cartesian": (0.29, 0.0071, 1.12, 1.14),
-            "world/cartesian": (0.32, 0.0065, 1.34, 1.35),
-            "robocentric, composed first/cartesian": (0.31, 0.0060, 1.04, 1.15),
-            **BESIDE,
-        },
-        batch=None,
+    "zhang-1": zhang_of(
+        0.01, invariant=(0.25, 0.0058, 1.02, 1.01), fej=(0.29, 0.0071, 1.12, 1.14),
+        world=(0.32, 0.0065, 1.34, 1.35), composed=(0.31, 0.0060, 1.04, 1.15),
     ),
-    "zhang-5": Study(
-        RAL,
-        partial(zhang, 0.05),
-        100,
-        8,
-        ZHANG,
-        {
-            "invariant/cartesian": (1.16, 0.027, 1.0, 1.01),
-            "world+fej/cartesian": (1.24, 0.029, 1.05, 1.13),
-            "world/cartesian": (2.0, 0.043, 3.7, 3.1),
-            "robocentric, composed first/cartesian": (2.4, 0.041, 3.0, 7.5),
-            **BESIDE,
-        },
-        batch=None,
+    "zhang-5": zhang_of(
+        0.05, invariant=(1.16, 0.027, 1.0, 1.01), fej=(1.24, 0.029, 1.05, 1.13),
+        world=(2.0, 0.043, 3.7, 3.1), composed=(2.4, 0.041, 3.0, 7.5),
     ),
-    "affine": Study(SONG, partial(affine, 0.01, 0.1), 50, 50, ZHANG[2:], AFFINE_FILTERS),
-    "affine-far": Study(SONG, partial(affine, 0.01, 0.2), 50, 50, ZHANG[2:], AFFINE_FILTERS),
-    "affine-fast": Study(SONG, partial(affine, 0.02, 0.1), 50, 50, ZHANG[2:], AFFINE_FILTERS),
-}
+    "affine": affine(0.01, 0.1),
+    "affine-far": affine(0.01, 0.2),
+    "affine-fast": affine(0.02, 0.1),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,10 +245,8 @@ class Tables(Benchmark):
                 found += [beside | row for row in rows]
                 yield {"rows": sorted(found, key=_place)}
 
-    def report(self, results: dict[str, Any]) -> None:
-        page = self.docs / "rivals.md"
-        if page.exists():
-            write_table(page, MARK, table_of(results["rows"]))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "rivals.md", MARK, table_of(results["rows"])
 
 
 def _place(row: dict[str, Any]) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, data_folder, number, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, data_folder, number, table
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -133,8 +133,8 @@ class RealLogs(Benchmark):
                 results.setdefault("smfeval", {})[name] = both
                 yield results
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "rivals.md", BEGIN, as_table(results["logs"]))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "rivals.md", BEGIN, as_table(results["logs"])
 
 
 def judged(log: RealLog, data: Path) -> dict[str, Any]:
@@ -287,4 +287,4 @@ def as_table(logs: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    run_one(RealLogs)
+    RealLogs.run()

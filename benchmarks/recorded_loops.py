@@ -14,19 +14,18 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
+from benchmark import RESULTS, OfRuns, data_folder, number, table
+from submaps import Filtered, filtered, simulated
 
 import jaxslam
-from jaxslam.consistency import run_through
 from jaxslam.evaluation.alignment import similarity
 from jaxslam.filters.protocol import LandmarkView
 from jaxslam.filters.slam import Slam
@@ -34,7 +33,7 @@ from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import difference
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.frame import Submaps
-from jaxslam.simulation import Room, Run, Scenario, simulate
+from jaxslam.simulation import Room, Run, Scenario
 from jaxslam.statistics import one_scale
 from jaxslam.statistics.beyond_scale import beyond_scale
 from jaxslam.tracking.places.closing import APART, GATE
@@ -55,7 +54,7 @@ NEARER = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedLoops(Benchmark):
+class RecordedLoops(OfRuns):
     """Loops along recorded trajectories."""
 
     trajectories: tuple[str, ...] = ("udel_gore", "tum_corridor1", "kitti_00")
@@ -63,11 +62,9 @@ class RecordedLoops(Benchmark):
     filter: str = "recommended"
     """The filter, with modifiers."""
     runs: int = 8
-    """Along every trajectory."""
     steps: int = 0
     """Fewer than the whole trajectory has, if not 0."""
     chunk: int = 4
-    """Runs in one batch."""
     seed: int = 11
     spare: int = 24
     """Slots for what is out of view."""
@@ -77,18 +74,19 @@ class RecordedLoops(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one trajectory at a time."""
-        results = self.found()
-        asked = {"runs": self.runs, "seed": self.seed}
-        for name in self.trajectories:
-            scenario = whole(name, self.steps)
-            told = {**asked, "steps": scenario.steps}
-            if any(results.get(name, {}).get(field) != value for field, value in told.items()):
-                rows = list(of_scenario(self, scenario))
-                results[name] = {**told, "each": rows}
-                yield results
+        worlds = {name: whole(name, self.steps) for name in self.trajectories}
+        of = {"runs": self.runs, "seed": self.seed}
+        yield from self.added(
+            (
+                (name,),
+                of | {"steps": scenario.steps},
+                lambda scenario=scenario: {"each": list(of_scenario(self, scenario))},
+            )
+            for name, scenario in worlds.items()
+        )
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "submaps.md", MARK, page(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "submaps.md", MARK, page(results)
 
 
 def page(results: dict[str, Any]) -> str:
@@ -120,29 +118,18 @@ def whole(trajectory: str, steps: int) -> Scenario:
     return jaxslam.scenario(f"handheld-{trajectory}", rate=rate, steps=steps or every, **lens)
 
 
-class Told(NamedTuple):
-    """What a filter says after every step."""
-
-    count: Any
-    """Submaps so far."""
-    numbers: Any
-    """Of the landmark in every slot; −1 where there is none."""
-
-
 def of_scenario(options: RecordedLoops, scenario: Scenario) -> Iterator[dict[str, Any]]:
     """The numbers of every run."""
     (base,) = jaxslam.make_filters(scenario, [options.filter], ["inverse_scaling"]).values()
     assert isinstance(base, Slam)
     slam = replace(base, frame=jaxslam.Submaps(options.spare, options.history))
-    simulated = jax.jit(jax.vmap(lambda key: simulate(scenario, key)))
     for start in range(0, options.runs, options.chunk):
-        indices = jnp.arange(start, min(start + options.chunk, options.runs))
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(options.seed)))(indices)
-        runs = simulated(keys)
+        indices = range(start, min(start + options.chunk, options.runs))
+        runs = simulated(scenario, options.seed, indices)
         began = time.perf_counter()
-        states, told = jax.device_get(_filtered(slam, _room(runs), runs))
+        told, states = jax.device_get(filtered(slam, _room(runs), runs))
         seconds = (time.perf_counter() - began) / len(indices)
-        for i, index in enumerate(indices.tolist()):
+        for i, index in enumerate(indices):
             run, state, one = jax.tree.map(lambda x, i=i: x[i], (runs, states, told))
             closing = Closing(scenario, slam, run, state, one, np.random.default_rng(index))
             row = {**closing.numbers(), "seconds": round(seconds, 1)}
@@ -156,27 +143,13 @@ def _room(runs: Run) -> Room:
     return Room(slots, slots, slots, int(runs.new[:, 1:].sum(axis=-1).max()))
 
 
-@eqx.filter_jit
-def _filtered(slam: Slam, room: Room, runs: Run) -> tuple[SubmapsState, Told]:
-    def told(state: SubmapsState, innovation: Any, frame: Any) -> Told:
-        del innovation, frame
-        return Told(state.count, jnp.append(state.numbers, -1)[state.slots])
-
-    return jax.vmap(lambda run: run_through(slam, room, run, told))(runs)
-
-
 class Closing:
     """One run whose loops are closed."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        slam: Slam,
-        run: Run,
-        state: SubmapsState,
-        told: Told,
+        self, scenario: Scenario, slam: Slam, run: Run, state: SubmapsState, told: Filtered,
         noise: np.random.Generator,
-    ) -> None:
+    ) -> None:  # fmt: skip
         assert isinstance(slam.frame, Submaps)
         history = slam.frame.history
         if int(state.count) > history:
@@ -281,7 +254,7 @@ class Closing:
         return {"now": float(nees[-1]), "old": float(nees[:-1].mean()), "ate": ate}
 
 
-def _points_by_number(run: Run, told: Told) -> np.ndarray:
+def _points_by_number(run: Run, told: Filtered) -> np.ndarray:
     """The true points of all landmarks, by their numbers."""
     numbers, points = np.asarray(told.numbers), np.asarray(run.points_by_frame)[1:]
     known = np.zeros((numbers.max() + 1, points.shape[-1]))

@@ -9,21 +9,19 @@ The settings are those of `jaxslam track`. Results are added to `rendered.json`,
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmark import RESULTS, Benchmark, number, table
 from rendered_videos import KINDS, rendered_source
 from scipy.stats import chi2
-from sequences import evaluated
-from starts import LIE
+from sequences import tracked
+from stress import LIE
 
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.video import track
 
 MARK = "<!-- by rendered.py -->"
 """Where the table stands in `docs/sequences.md`."""
@@ -55,15 +53,13 @@ class Rendered(Benchmark):
                 print(name, seed, done, flush=True)
                 yield results
 
-    def report(self, results: Results) -> None:
-        write_table(self.docs / "sequences.md", MARK, as_table(results))
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
+        yield "sequences.md", MARK, as_table(results)
 
 
 def measure(source) -> dict[str, Any]:
     """The numbers of one video."""
-    with tempfile.TemporaryDirectory() as folder:
-        summary = track(source, folder, TrackerSettings(), overlay=False)
-        found = evaluated(source, Path(folder))
+    summary, found = tracked(source, TrackerSettings())
     numbers = {
         key: summary[key]
         for key in ("frames", "tracked", "maps", "loops", "loops_refused", "matches_per_frame")

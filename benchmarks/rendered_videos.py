@@ -306,7 +306,10 @@ def rendered_source(
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path and path.exists() else None
             if image is None:
                 image = _picture(kind, bodies, modifiers, seed, index)
-                _keep(image, path)
+                if path:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    with write_atomically(path) as temporary:
+                        cv2.imwrite(str(temporary), image)
             yield image
 
     truth = Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1])))
@@ -319,10 +322,8 @@ def _lens(modifiers: list[str]) -> Calibration:
 
 def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, index: int) -> Image:
     """The picture of a frame, which is exposed about its time, with the noise of a sensor."""
-    time, sky = (
-        index / kind.rate,
-        245.0 if kind.scene in (_on_white, _street, _block, _row) else 110.0,
-    )
+    time, outside = index / kind.rate, (_on_white, _street, _block, _row)
+    sky = 245.0 if kind.scene in outside else 110.0
     offsets = np.zeros(1)
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
@@ -331,13 +332,6 @@ def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, in
     if "exposure" in modifiers:
         grey = (0.8 + 0.25 * np.cos(2 * np.pi * time / 5.3)) * grey + 12 * np.sin(time)
     return add_noise(as_image(grey), np.random.default_rng([seed, 2, index]))
-
-
-def _keep(image: Image, path: Path | None) -> None:
-    if path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with write_atomically(path) as temporary:
-            cv2.imwrite(str(temporary), image)
 
 
 def _paint(rng: np.random.Generator, density: float, contrast: float = 90.0) -> Paint:

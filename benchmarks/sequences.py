@@ -13,8 +13,6 @@ what is there.
 
 from __future__ import annotations
 
-import itertools
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,11 +21,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
+from benchmark import RESULTS, Benchmark, data_folder, number, table
 
 from jaxslam.evaluation import Evaluation, evaluate_log
+from jaxslam.io.opening import open_source
 from jaxslam.io.tum import write_tum
 from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.video import track
 
 REFERENCES = {
     "costado": (0.005, 0.1),
@@ -55,7 +56,7 @@ WORLD_CENTRIC = "world_gauge+oc+scene50+drift+mixture3+rest8"
 OWN = f"{ON_VIDEO}/{LANDMARKS}"
 
 Results = dict[str, dict[str, dict[str, Any]]]
-"""`results[sequence][filter/landmarks]`, and `/white` where the calibration is not `known`."""
+"""`results[sequence][filter/landmarks]`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +66,7 @@ class Sequences(Benchmark):
     sequences: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Data set folders or videos with their calibration beside them; by default all there are."""
     filters: tuple[str, ...] = (ON_VIDEO, WORLD_CENTRIC, "robocentric", "world")
-    """Filters."""
-    landmarks: tuple[str, ...] = ("inverse_scaling",)
-    """Landmark parametrizations."""
-    calibrations: tuple[str, ...] = ("known",)
-    """Treatments of the calibration: known or white."""
+    """Filters, with their modifiers; calibrations are taken as exact."""
     out: Path = RESULTS / "sequences.json"
     double = False
 
@@ -77,29 +74,22 @@ class Sequences(Benchmark):
         results: Results = self.found()
         for source in _sources(self):
             done = results.setdefault(source.name, {})
-            for name, landmarks, calibration in itertools.product(
-                self.filters, self.landmarks, self.calibrations
-            ):
-                settings = TrackerSettings(name, landmarks, calibration)
-                key = f"{settings.filter}/{landmarks}"
-                key += "" if calibration == "known" else f"/{calibration}"
+            for name in self.filters:
+                settings = TrackerSettings(name, LANDMARKS, "known")
+                key = f"{settings.filter}/{LANDMARKS}"
                 done[key] = measure(source, settings)
                 print(source.name, key, done[key], flush=True)
                 yield results
 
-    def report(self, results: Results) -> None:
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
         for mark, part in PARTS.items():
-            write_table(self.docs / "sequences.md", mark, part(results))
-        write_table(self.docs / "results.md", MARK, words(results))
+            yield "sequences.md", mark, part(results)
+        yield "results.md", MARK, words(results)
 
 
 def measure(source, settings: TrackerSettings) -> dict[str, Any]:
     """One filter on one sequence."""
-    from jaxslam.tracking.video import track
-
-    with tempfile.TemporaryDirectory() as folder:
-        summary = track(source, folder, settings, overlay=False)
-        found = evaluated(source, Path(folder))
+    summary, found = tracked(source, settings)
     nis, ate, rpe = summary["nis"], summary.get("ate"), summary.get("rpe")
     ungated = summary["nis_ungated"]
     return {
@@ -120,6 +110,13 @@ def measure(source, settings: TrackerSettings) -> dict[str, Any]:
         "milliseconds": round(1e3 * summary["seconds"]["per_frame_median"], 1),
         "milliseconds_p99": round(1e3 * summary["seconds"]["per_frame_p99"], 1),
     }
+
+
+def tracked(source, settings: TrackerSettings) -> tuple[dict[str, Any], Evaluation | None]:
+    """What `jaxslam track` writes of a video, in numbers, and what its files claim."""
+    with tempfile.TemporaryDirectory() as folder:
+        summary = track(source, folder, settings, overlay=False)
+        return summary, evaluated(source, Path(folder))
 
 
 def evaluated(source, folder: Path) -> Evaluation | None:
@@ -281,9 +278,6 @@ def _share(r: dict[str, Any], key: str) -> str:
 
 
 def _sources(options: Sequences) -> Iterator[Any]:
-    from jaxslam.io.opening import open_source
-    from jaxslam.tracking.synthetic import synthetic_source
-
     there = sorted(path.parent for path in data_folder().glob("*/images"))
     yield from map(open_source, options.sequences or there)
     if not options.sequences:
@@ -291,5 +285,4 @@ def _sources(options: Sequences) -> Iterator[Any]:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     Sequences.run()

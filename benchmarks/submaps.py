@@ -23,12 +23,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmark import RESULTS, OfRuns, number, table
 from submaps_batch import batch_positions
 
 import jaxslam
 from jaxslam.consistency import run_through
 from jaxslam.filters import Chain, Loops, agreeing, base_poses, chain, close
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps.handover import SubmapsState
 from jaxslam.geometry import difference, scaled
 from jaxslam.simulation import Room, Run, Scenario, simulate
@@ -43,17 +44,14 @@ LAPS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Submaps(Benchmark):
+class Submaps(OfRuns):
     """Submaps and loops."""
 
     scenarios: tuple[str, ...] = ("laps", "laps-6dof")
-    """What is simulated."""
     runs: int = 100
-    """Of each."""
     steps: int = 0
     """Fewer than the scenario's, if not 0."""
     chunk: int = 20
-    """Runs in one batch."""
     seed: int = 11
     spare: int = 24
     """Slots for what is out of view."""
@@ -65,17 +63,14 @@ class Submaps(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """Add what is not measured yet, one scenario at a time."""
-        results = self.found()
-        for name in self.scenarios:
-            told = {"runs": self.runs, "seed": self.seed, "wrong": self.wrong, "steps": self.steps}
-            key = f"{name}, {100 * self.wrong:.0f} % wrong"
-            if any(results.get(key, {}).get(field) != value for field, value in told.items()):
-                results[key] = {**told, **measured(self, name)}
-                print(results[key], flush=True)
-                yield results
+        of = {"runs": self.runs, "seed": self.seed, "wrong": self.wrong, "steps": self.steps}
+        yield from self.added(
+            ((f"{name}, {100 * self.wrong:.0f} % wrong",), of, partial(measured, self, name))
+            for name in self.scenarios
+        )
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "submaps.md", MARK, page(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "submaps.md", MARK, page(results)
 
 
 def page(results: dict[str, Any]) -> str:
@@ -155,13 +150,12 @@ class Filtered(NamedTuple):
 
 def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str, Any]]:
     """The numbers of some runs."""
-    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(options.seed)))
-    runs = _simulated(scenario, keys(jnp.arange(indices.start, indices.stop)))
+    runs = simulated(scenario, options.seed, indices)
     slots = scenario.in_view
     room = Room(slots, slots, slots, slots)
     around = replace(slam, frame=jaxslam.Submaps(options.spare, options.history))
-    plain, _ = _filtered(slam, room, runs)
-    ours, states = _filtered(around, room, runs)
+    plain, _ = filtered(slam, room, runs)
+    ours, states = filtered(around, room, runs)
     rows = []
     for i in range(len(indices)):
         run, state, told = jax.tree.map(lambda x, i=i: x[i], (runs, states, ours))
@@ -171,26 +165,24 @@ def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str
     return rows
 
 
-def _simulated(scenario: Scenario, keys) -> Run:
+def simulated(scenario: Scenario, seed: int, indices: range) -> Run:
+    """Runs of these numbers, a batch."""
+    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(indices))
     return jax.jit(jax.vmap(lambda key: simulate(scenario, key)))(keys)
 
 
-def _filtered(slam, room: Room, runs: Run):
-    """The numbers of every step, and the last state."""
+@eqx.filter_jit
+def filtered(slam: Slam, room: Room, runs: Run) -> tuple[Filtered, Any]:
+    """What is said of every step, and the last state."""
 
     def output(state, innovation, frame):
-        del innovation
         error, P = slam.pose_error(state, frame.pose)
         nees = normalised_squared(error, P) / error.size
         if not isinstance(state, SubmapsState):
             return Filtered(nees, jnp.zeros((), int), jnp.zeros(0, int))
         return Filtered(nees, state.count, jnp.append(state.numbers, -1)[state.slots])
 
-    def one(run):
-        state, told = run_through(slam, room, run, output)
-        return told, state
-
-    return jax.jit(jax.vmap(one))(runs)
+    return jax.vmap(lambda run: run_through(slam, room, run, output)[::-1])(runs)
 
 
 def of_run(options, scenario, slam, run: Run, state, told: Filtered, index: int) -> dict[str, Any]:

@@ -11,19 +11,17 @@ Each writes a JSON file of its name; `verdicts` the table in `docs/consistency.m
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from benchmark import RESULTS, Benchmark, run_one, table, write_table
+from benchmark import RESULTS, Benchmark, run_one, table
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
@@ -73,14 +71,10 @@ class Verdicts(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng(0)
-        yield {
-            "by_factor": by_factor(self, rng),
-            "ramps": ramps(self, rng),
-            "heavy": heavy(self, rng),
-        }
+        yield {of.__name__: of(self, rng) for of in (by_factor, ramps, heavy)}
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "consistency.md", BEGIN, as_table(results))
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "consistency.md", BEGIN, as_table(results)
 
 
 def series(
@@ -91,18 +85,6 @@ def series(
         return rng.chisquare(dof, (runs, steps))
     error = correlated(rng.normal(size=(steps + 1, runs, dof)), correlation)
     return np.sum(error[:-1] ** 2, axis=2).T
-
-
-def drawn(
-    rng: np.random.Generator,
-    dof: int,
-    steps: int,
-    correlation: float,
-    scale: float | np.ndarray,
-    runs: int,
-) -> np.ndarray:
-    """The NEES of so many runs, so many times as large as a right filter's at every step."""
-    return scale * series(rng, runs, dof, steps, correlation)
 
 
 def tallies(nees: np.ndarray, dof: int) -> Iterator[Tally]:
@@ -119,13 +101,21 @@ def tallies(nees: np.ndarray, dof: int) -> Iterator[Tally]:
         yield Tally(dof, runs, 0, 0, average, end, average, thirds=(first, second, last))
 
 
-def words(draw: Callable[[int], np.ndarray], dof: int, runs: int, studies: int) -> dict[str, float]:
-    """Shares of the words of so many studies; `draw` makes NEES of so many runs."""
+def words(
+    rng: np.random.Generator,
+    name: str,
+    dof: int,
+    runs: int,
+    studies: int,
+    scale: float | np.ndarray,
+) -> dict[str, float]:
+    """Shares of the words of so many studies, NEES so many times a right filter's at every step."""
     found: Counter[str] = Counter()
     at_once = max(1, 100000 // runs)
     for start in range(0, studies, at_once):
         count = min(at_once, studies - start)
-        for tally in tallies(draw(count * runs).reshape(count, runs, -1), dof):
+        nees = scale * series(rng, count * runs, dof, *SERIES[name])
+        for tally in tallies(nees.reshape(count, runs, -1), dof):
             found[tally.decisive().word] += 1
     return {word: number / studies for word, number in sorted(found.items())}
 
@@ -140,13 +130,12 @@ def by_factor(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any
     rows = []
     for dof in options.dof:
         for runs in options.runs:
-            for name, (steps, correlation) in SERIES.items():
+            for name in SERIES:
                 studies = options.studies // (10 if runs >= 1000 else 1)
                 found = {}
                 for factor in (1.0, *WRONG, *(1 / x for x in WRONG)):
-                    draw = partial(drawn, rng, dof, steps, correlation, factor**2)
                     count = studies if factor == 1 else max(studies // 5, 1)
-                    found[f"{factor:.3g}"] = words(draw, dof, runs, count)
+                    found[f"{factor:.3g}"] = words(rng, name, dof, runs, count, factor**2)
                 row = {"dof": dof, "runs": runs, "series": name, "studies": studies}
                 rows.append(row | {"words": found})
                 print(dof, runs, name, f"{wrong_share(found['1']):.4f}", flush=True)
@@ -158,10 +147,9 @@ def ramps(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any]]:
     rows = []
     for runs in options.runs:
         for name in ("white", "correlated"):
-            steps, correlation = SERIES[name]
-            draw = partial(drawn, rng, 3, steps, correlation, np.linspace(0.7, 1.3, steps))
             studies = max(options.studies // (50 if runs >= 1000 else 5), 1)
-            rows.append({"runs": runs, "series": name, "words": words(draw, 3, runs, studies)})
+            told = words(rng, name, 3, runs, studies, np.linspace(0.7, 1.3, STEPS))
+            rows.append({"runs": runs, "series": name, "words": told})
     return rows
 
 
@@ -189,15 +177,10 @@ def heavy(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any]]:
 def as_table(results: dict[str, Any]) -> str:
     """The worst of all degrees of freedom and series, by the number of runs."""
     header = (
-        "runs",
-        "consistent filter called inconsistent",
-        "σ wrong by 1.3 called consistent",
-        "σ wrong by 1.1 found",
-        "by 1.3",
-        "by 2",
-        "opposite faults found",
+        "runs", "consistent filter called inconsistent", "σ wrong by 1.3 called consistent",
+        "σ wrong by 1.1 found", "by 1.3", "by 2", "opposite faults found",
         "heavy tails, truth in interval",
-    )
+    )  # fmt: skip
     lines = []
     for runs in sorted({row["runs"] for row in results["by_factor"]}):
         cells = [row["words"] for row in results["by_factor"] if row["runs"] == runs]
@@ -275,10 +258,6 @@ class Conventions(Benchmark):
                 result["wrong_sigma"].append(blamed(position, rotation, runs, sets))
                 yield result
 
-    def report(self, results: dict[str, Any]) -> None:
-        *_, last = results["wrong_sigma"]
-        print(json.dumps({**results, "wrong_sigma": last}), flush=True)
-
 
 def constructed(number: int, runs: int) -> Case:
     """The case of a number; the same in any number of them."""
@@ -286,11 +265,8 @@ def constructed(number: int, runs: int) -> Case:
     kind, geometry = CASES[number % len(CASES)], (SPATIAL, SPATIAL, PLANAR)[number % 3]
     kinds = alternatives(Convention(("right", "split")[rng.integers(2)]), geometry)
     true, stated = (kinds[i] for i in rng.integers(len(kinds), size=2))
-    T = _poses(rng, geometry, runs, 0.0 if kind == "still" else 1.0)
-    P = _covariances(rng, geometry, T.shape[:2], isotropic=kind == "isotropic")
-    sigma = {"over-confident": 1.3, "under-confident": 0.7}.get(kind, 1.0)
-    noise = sigma * _series(rng, (*T.shape[:2], P.shape[-1]))
-    errors = np.einsum("...ij,...j->...i", np.linalg.cholesky(P), noise)
+    T, P, errors = _drawn(rng, geometry, runs, kind)
+    errors *= {"over-confident": 1.3, "under-confident": 0.7}.get(kind, 1.0)
     answer = true if kind == "anisotropic" else None
     return Case(kind, T, P, displaced(T, errors, true), stated, answer)
 
@@ -314,6 +290,16 @@ def displaced(T: np.ndarray, errors: np.ndarray, convention: Convention) -> np.n
 @eqx.filter_jit
 def _exp(geometry: Geometry, own: Float[AnyArray, "k t"]) -> Array:
     return jax.vmap(lambda delta: exp(geometry.group, delta).as_matrix())(own)
+
+
+def _drawn(
+    rng: np.random.Generator, geometry: Geometry, runs: int, kind: str = ""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, covariances, and errors drawn from these."""
+    T = _poses(rng, geometry, runs, 0.0 if kind == "still" else 1.0)
+    P = _covariances(rng, geometry, T.shape[:2], isotropic=kind == "isotropic")
+    noise = _series(rng, (*T.shape[:2], P.shape[-1]))
+    return T, P, np.einsum("...ij,...j->...i", np.linalg.cholesky(P), noise)
 
 
 def _poses(rng: np.random.Generator, geometry: Geometry, runs: int, spread: float) -> np.ndarray:
@@ -357,10 +343,7 @@ def with_factors(number: int, runs: int, position: float, rotation: float) -> Ca
     geometry = (SPATIAL, SPATIAL, PLANAR)[number % 3]
     kinds = alternatives(Convention(("right", "split")[rng.integers(2)]), geometry)
     true = kinds[rng.integers(len(kinds))]
-    T = _poses(rng, geometry, runs, 1.0)
-    P = _covariances(rng, geometry, T.shape[:2], isotropic=False)
-    noise = _series(rng, (*T.shape[:2], P.shape[-1]))
-    errors = np.einsum("...ij,...j->...i", np.linalg.cholesky(P), noise)
+    T, P, errors = _drawn(rng, geometry, runs)
     turns = [name.startswith("r") for name in true.names(geometry)]
     errors *= np.where(turns, rotation, position)
     return Case("wrong σ", T, P, displaced(T, errors, true), true, true)

@@ -38,8 +38,7 @@ from jaxslam.consistency import draw
 from jaxslam.statistics import lost_threshold
 
 sys.path.append("../benchmarks")  # of the repository, beside this folder
-from modes import followed, modes_of_run
-from modes_figure import plot_modes, worlds_of
+from modes import followed, modes_of_run, plot_modes, worlds_of
 
 jax.config.update("jax_enable_x64", True)
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))

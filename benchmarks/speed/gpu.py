@@ -30,7 +30,7 @@ import jax
 import numpy as np
 
 import jaxslam
-from benchmarks.benchmark import RESULTS, Benchmark, number, table, write_table
+from benchmarks.benchmark import RESULTS, Benchmark, number, table
 from benchmarks.speed.__main__ import difference
 from benchmarks.speed.workload import (
     WORKLOADS,
@@ -55,6 +55,8 @@ PART = 100
 """The most runs that a processor computes at a time, as in a study."""
 MEMORY_SHARE = 0.9
 """Of the memory that JAX may use: the most that a batch is expected to need."""
+Left = Callable[[], float]
+"""The seconds that are left."""
 Row = dict[str, Any] | str
 """What was measured, or why it was left out."""
 
@@ -92,24 +94,28 @@ class OnGpu(Benchmark):
     out: Path = RESULTS / "gpu.json"
 
     def measure(self) -> Iterator[dict[str, Any]]:
-        clock, device = Clock(60 * self.minutes), found_device(self.device)
+        device, end = jax.devices(self.device)[0], time.monotonic() + 60 * self.minutes
         results = {**surroundings(device), "steps": self.steps, "filters": {}, "left_out": []}
-        for name, part in self.parts(device, clock, results):
-            if clock.left() <= 0:
+
+        def left() -> float:
+            return end - time.monotonic()
+
+        for name, part in self.parts(device, left, results):
+            if left() <= 0:
                 results["left_out"].append(f"{name}: no time left")
                 continue
-            print(f"{name} ({clock.left():.0f} s left)", file=sys.stderr, flush=True)
+            print(f"{name} ({left():.0f} s left)", file=sys.stderr, flush=True)
             try:
                 for _ in part():
-                    yield {**results, "minutes": rounded(clock.minutes())}
+                    yield results
             except jax.errors.JaxRuntimeError as error:  # what else was measured counts
                 results["left_out"].append(f"{name}: {one_line(error)}")
-        yield {**results, "minutes": rounded(clock.minutes())}
+        yield results | {"minutes": rounded(self.minutes - left() / 60)}
         if wrong := disagreeing(results):
             raise ValueError(f"not the same results on the device and on the CPU: {wrong}")
 
     def parts(
-        self, device: jax.Device, clock: Clock, results: dict[str, Any]
+        self, device: jax.Device, left: Left, results: dict[str, Any]
     ) -> Iterator[tuple[str, Callable[[], Iterator[None]]]]:
         """All that is measured, each with its name."""
         inputs = cache(self.inputs)
@@ -118,9 +124,9 @@ class OnGpu(Benchmark):
             for name in self.workloads:
                 of = results["filters"].setdefault(name, {}).setdefault(dtype, {})
                 given = partial(inputs, name)
-                yield f"{name}, {dtype}", partial(self.filters, given, dtype, device, clock, of)
+                yield f"{name}, {dtype}", partial(self.filters, given, dtype, device, left, of)
                 if name == first and dtype == self.dtypes[0]:
-                    yield "studies", partial(self.whole_studies, first, clock, results)
+                    yield "studies", partial(self.whole_studies, first, left, results)
                     yield "recommended", partial(self.mixture, results)
         if "float32" in self.dtypes:
             given = partial(inputs, first)
@@ -136,7 +142,7 @@ class OnGpu(Benchmark):
             return prepared(self.work(name, self.drawn, self.steps))
 
     def filters(
-        self, inputs: Callable[[], Inputs], dtype: str, device: jax.Device, clock: Clock,
+        self, inputs: Callable[[], Inputs], dtype: str, device: jax.Device, left: Left,
         of: dict[str, Any],
     ) -> Iterator[None]:  # fmt: skip
         """One workload in one precision: all processors, then ever larger batches."""
@@ -146,13 +152,13 @@ class OnGpu(Benchmark):
         filters, of["device"] = Filters(given, dtype, device), {}
         last = None
         for runs in self.batches:
-            row = self.too_much(last, runs, device, clock) or self.batch(filters, runs, wanted)
+            row = self.too_much(last, runs, device, left) or self.batch(filters, runs, wanted)
             of["device"][str(runs)] = row
             last = last if isinstance(row, str) else {**row, "runs": runs}
             yield
 
     def too_much(
-        self, last: dict[str, Any] | None, runs: int, device: jax.Device, clock: Clock
+        self, last: dict[str, Any] | None, runs: int, device: jax.Device, left: Left
     ) -> str | None:
         """Why a batch is not to be tried after the last one that was measured."""
         if last is None:
@@ -164,7 +170,7 @@ class OnGpu(Benchmark):
             return f"needs about {needed / 2**30:.0f} GiB of {limit / 2**30:.0f}"
         if seconds > self.call_seconds:
             return f"a call would take about {seconds:.0f} s"
-        if 1.5 * last["compile_seconds"] + 2 * seconds > clock.left():
+        if 1.5 * last["compile_seconds"] + 2 * seconds > left():
             return "no time left"
         return None
 
@@ -213,13 +219,13 @@ class OnGpu(Benchmark):
             row["native"] = rounded(1e6 * self.median(native) / self.drawn / self.steps)
         return row, (nees, covariance)
 
-    def whole_studies(self, name: str, clock: Clock, results: dict[str, Any]) -> Iterator[None]:
+    def whole_studies(self, name: str, left: Left, results: dict[str, Any]) -> Iterator[None]:
         """Studies by XLA on the default device, and by the processors in another process."""
         of: dict[str, Any] = {"steps": self.study_steps, "chunk": self.chunk}
         results["studies"] = of
         each = 0.0
         for runs in self.studies:
-            if each * runs > clock.left():
+            if each * runs > left():
                 of[str(runs)] = "no time left"
                 continue
             of[str(runs)] = self.study(name, runs)
@@ -319,22 +325,8 @@ class OnGpu(Benchmark):
             seconds.append(time.perf_counter() - began)
         return float(np.median(seconds))
 
-    def report(self, results: dict[str, Any]) -> None:
-        write_table(self.docs / "speed.md", BEGIN, shown(results))
-
-
-class Clock:
-    """The time that is left."""
-
-    def __init__(self, seconds: float) -> None:
-        self._began, self._seconds = time.monotonic(), seconds
-
-    def minutes(self) -> float:
-        return (time.monotonic() - self._began) / 60
-
-    def left(self) -> float:
-        """Seconds."""
-        return self._seconds - 60 * self.minutes()
+    def tables(self, results: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+        yield "speed.md", BEGIN, shown(results)
 
 
 class Filters:
@@ -377,34 +369,14 @@ class Filters:
             return jax.jit(batch).lower(*data).compile(), time.perf_counter() - began
 
 
-def found_device(kind: str) -> jax.Device:
-    """The first device of a kind; without any, the program ends with a word and status 1."""
-    try:
-        return jax.devices(kind)[0]
-    except RuntimeError as error:
-        raise SystemExit(
-            f"no {kind.upper()} is there for JAX, so nothing is measured ({one_line(error)}); "
-            "--device cpu tries the program out"
-        ) from None
-
-
 def surroundings(device: jax.Device) -> dict[str, Any]:
     """Where it is measured."""
     return {
         "device": device.device_kind,
         "memory_GiB": rounded(memory_of(device) / 2**30),
-        "processor": processor_name(),
         "processors": processors(),
         "jax": jax.__version__,
     }
-
-
-def processor_name() -> str:
-    """The processor's name, where Linux tells it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else "unknown"
 
 
 def memory_of(device: jax.Device) -> int:
@@ -437,62 +409,34 @@ def disagreeing(results: dict[str, Any]) -> dict[str, float]:
 
 
 def shown(results: dict[str, Any]) -> str:
-    """The page's part: what was measured and what was left out."""
-    if not any(of for each in results.get("filters", {}).values() for of in each.values()):
-        return "Not measured yet."
-    columns = [
-        (f"{name}, {dtype}", of)
+    """The page's tables: of the filter alone, and of whole studies."""
+    columns = {
+        f"{name}, {dtype}": of
         for name, each in results["filters"].items()
         for dtype, of in each.items()
         if of
-    ]
-    parts = [
-        answer(results),
-        table(
-            ("µs a step of a run", *(name for name, _ in columns)), filter_rows(results, columns)
-        ),
-        *studies_shown(results),
-    ]
-    if any(isinstance(row, str) for _, of in columns for row in of.get("device", {}).values()):
-        parts.append("A dash stands where a batch needs more memory, or time, than there is.")
+    }
+    if not columns:
+        return "Not measured yet."
+    rows = filter_rows(results["processors"], list(columns.values()))
+    parts = [table(("µs a step of a run", *columns), rows)]
+    if of := results.get("studies"):
+        header = (f"a whole study of {of['steps']} steps", "runs", "µs a step of a run", "s")
+        parts.append(table(header, study_rows(results["processors"], of)))
     if left := results["left_out"]:
         parts.append("\n".join(["Left out:", "", *(f"- {why}" for why in left)]))
     return "\n\n".join(parts)
 
 
-def answer(results: dict[str, Any]) -> str:
-    """The fastest batch of each workload in float64, beside the processors."""
-    said = []
-    for name, each in results["filters"].items():
-        of = each.get("float64", {})
-        rows = {int(n): x for n, x in of.get("device", {}).items() if not isinstance(x, str)}
-        if not rows:
-            continue
-        runs = min(rows, key=lambda n: rows[n]["microseconds_per_step"])
-        fastest = rows[runs]["microseconds_per_step"]
-        there = {
-            "XLA": of["processors"]["xla"],
-            "the native backend": of["processors"].get("native"),
-        }
-        times = " and ".join(
-            f"{x / fastest:.2g} times as long by {k}" for k, x in there.items() if x
-        )
-        said.append(
-            f"{name} takes {fastest:.3g} µs a step of a run in batches of {runs:,} in float64; all "
-            f"{results['processors']} processors beside it take {times}."
-        )
-    return " ".join([*said, f"Measured on an {results['device']}, JAX {results['jax']}."])
-
-
-def filter_rows(results: dict[str, Any], columns: list[tuple[str, Any]]) -> Iterator[list[str]]:
-    """The rows of the filter alone."""
-    for key in ("xla", "native"):
-        name = f"{results['processors']} processors, {'XLA' if key == 'xla' else key}"
-        yield [name, *(digits(of.get("processors", {}).get(key)) for _, of in columns)]
-    sizes = sorted({int(n) for _, of in columns for n in of.get("device", {})})
+def filter_rows(count: int, columns: list[dict[str, Any]]) -> Iterator[list[str]]:
+    """The rows of the filter alone; a dash where memory or time is too short."""
+    for key, backend in (("xla", "XLA"), ("native", "native")):
+        cells = (digits(of.get("processors", {}).get(key)) for of in columns)
+        yield [f"{count} processors, {backend}", *cells]
+    sizes = sorted({int(n) for of in columns for n in of.get("device", {})})
 
     def row(what: str, key: str, runs: int) -> list[str]:
-        rows = [of.get("device", {}).get(str(runs)) for _, of in columns]
+        rows = [of.get("device", {}).get(str(runs)) for of in columns]
         return [what, *(digits(row[key] if isinstance(row, dict) else None) for row in rows)]
 
     for runs in sizes:
@@ -502,41 +446,14 @@ def filter_rows(results: dict[str, Any], columns: list[tuple[str, Any]]) -> Iter
         yield row("largest difference from the CPU", "largest_difference", runs)
 
 
-def studies_shown(results: dict[str, Any]) -> Iterator[str]:
-    """A table of whole studies, and a sentence each on the Gaussian sum and on float32."""
-    if of := results.get("studies"):
-        found = {key: row for key, row in of.items() if isinstance(row, dict)}
-        count = results["processors"]
-        names = {"processors_xla": "XLA", "processors_native": "native"}
-        rows = [
-            (
-                f"{count} processors, {names[key]}"
-                if key in names
-                else f"on the device, chunks of {of['chunk']:,}",
-                f"{row.get('runs') or int(key):,}",
-                digits(row["microseconds_per_step"]),
-                digits(row["seconds"]),
-            )
-            for key, row in found.items()
-        ]
-        header = (f"a whole study of {of['steps']} steps", "runs", "µs a step of a run", "s")
-        yield table(header, rows)
-    if of := results.get("recommended"):
-        each = of["microseconds_per_step"]
-        yield (
-            f"On `matched` ({of['runs']:,} runs × {of['steps']}, chunks of {of['chunk']:,}) "
-            f"`recommended` takes {digits(each['recommended'])} µs a step, {of['relative']:.3g} "
-            f"times as long as `robocentric`."
-        )
-    if of := results.get("float32_beside_float64"):
-        both = of["whole_products"], of["short_products"]
-        off, off_short = (f"{100 * one['largest_difference']:.2g} %" for one in both)
-        mean, mean_short = (f"{one['mean_nees']:.4g}" for one in both)
-        yield (
-            f"In float32 the NEES of single steps differ by up to {off} from those in float64, and "
-            f"by {off_short} with the products that JAX takes on a GPU unasked; their mean is "
-            f"{of['mean_nees']:.4g} in float64, {mean} and {mean_short}."
-        )
+def study_rows(count: int, of: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The rows of whole studies."""
+    names = {f"processors_{key.lower()}": f"{count} processors, {key}" for key in ("XLA", "native")}
+    for key, row in of.items():
+        if isinstance(row, dict):
+            where = names.get(key, f"on the device, chunks of {of['chunk']:,}")
+            numbers = digits(row["microseconds_per_step"]), digits(row["seconds"])
+            yield where, f"{row.get('runs') or int(key):,}", *numbers
 
 
 def digits(value: float | None) -> str:

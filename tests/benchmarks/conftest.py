@@ -3,6 +3,5 @@
 from jaxtyping import install_import_hook
 
 install_import_hook(
-    ["exact_posterior", "modes", "modes_figure", "tracks"],
-    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+    ["modes", "tracks"], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 )

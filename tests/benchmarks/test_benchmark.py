@@ -3,12 +3,14 @@
 import json
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 import verdicts
-from benchmark import END, Benchmark, number, run_one, table, write_table
+from benchmark import END, Benchmark, by_batch, number, run_one, table
 
 MARK = "<!-- counted -->"
 
@@ -28,9 +30,8 @@ class Counted(Benchmark):
         if self.to > 3:
             raise ValueError("too far")
 
-    def report(self, results):
-        rows = [(i, i**2) for i in results["done"]]
-        write_table(self.docs / "page.md", MARK, table(("i", "i²"), rows))
+    def tables(self, results):
+        yield "page.md", MARK, table(("i", "i²"), [(i, i**2) for i in results["done"]])
 
 
 @pytest.fixture
@@ -45,6 +46,35 @@ def test_results_are_added_to_and_their_table_takes_the_place_of_the_old_one(fol
     assert json.loads((folder / "results" / "counted.json").read_text()) == {"done": [0, 1, 2]}
     rows = "| i | i² |\n|---|---|\n| 0 | 0 |\n| 1 | 1 |\n| 2 | 4 |"
     assert (folder / "page.md").read_text() == f"before\n{MARK}\n\n{rows}\n\n{END}\nafter\n"
+
+
+def test_what_is_there_is_not_measured_again_but_of_other_numbers_of_runs(folder):
+    study, asked = Counted(out=folder / "x.json"), []
+
+    def measure(name):
+        asked.append(name)
+        return {"of": name}
+
+    def cases(runs):
+        for name in "ab":
+            yield ("where", name), {"runs": runs}, partial(measure, name)
+
+    assert [len(results["where"]) for results in study.added(cases(3))] == [1, 2]
+    for results in study.added(cases(3)):
+        study.save(results)
+    asked.clear()
+    assert not list(study.added(cases(3)))
+    assert not asked
+    *_, found = study.added(cases(4))
+    assert asked == ["a", "b"]
+    assert found == {"where": {name: {"runs": 4, "of": name} for name in "ab"}}
+
+
+def test_records_of_batches_are_those_of_all_runs():
+    x = np.arange(14.0).reshape(7, 2)
+    found = by_batch(lambda runs: {"twice": 2 * runs, "sum": runs.sum(axis=1)}, x, 3)
+    np.testing.assert_array_equal(found["twice"], 2 * x)
+    np.testing.assert_array_equal(found["sum"], x.sum(axis=1))
 
 
 def test_what_was_found_before_an_error_is_kept(folder):
@@ -74,8 +104,7 @@ def test_a_page_without_a_place_and_a_broken_file_are_refused(folder):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
-    [(None, "–"), (float("nan"), "–"), (3.14159, "3.14"), (-12345.0, "-1.2e+04")],
+    ("value", "said"), [(None, "–"), (float("nan"), "–"), (3.14159, "3.14"), (-12345.0, "-1.2e+04")]
 )
 def test_numbers_of_a_table_are_short(value, said):
     assert number(value) == said

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from functools import cache
-from pathlib import Path
 
 import jax
 import pytest
@@ -22,22 +21,20 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu, "prepared", drawn_once)
     monkeypatch.setitem(WORKLOADS, "A", dataclasses.replace(WORKLOADS["A"], landmarks=3))
     (tmp_path / "speed.md").write_text(f"{BEGIN}\n\n{END}\n")
-    return OnGpu(
-        device="cpu", workloads=("A",), dtypes=("float64",), batches=(2, 6), drawn=4, steps=2,
-        studies=(), mixture_runs=0, repeats=1, out=tmp_path / "gpu.json", docs=tmp_path,
-    )  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def double():
     with jax.enable_x64(True):
-        yield
+        yield OnGpu(
+            device="cpu", workloads=("A",), dtypes=("float64",), batches=(2, 6), drawn=4, steps=2,
+            studies=(), mixture_runs=0, repeats=1, out=tmp_path / "gpu.json", docs=tmp_path,
+        )  # fmt: skip
 
 
 @pytest.mark.slow
-def test_batches_are_timed_and_compared_with_the_processors(small):
-    """Against the native backend too, which is compiled; quickly a batch is timed below."""
-    small()
+def test_everything_is_measured_and_compared_with_the_processors(small):
+    """Keys of the page that only studies and the mixture fill in, and wrong records of a batch."""
+    dataclasses.replace(
+        small, dtypes=("float64", "float32"), studies=(4, 6), chunk=4, study_steps=2,
+        mixture_runs=2,
+    )()  # fmt: skip
     found = json.loads(small.out.read_text())
     of = found["filters"]["A"]["float64"]
     assert list(of["device"]) == ["2", "6"]
@@ -46,9 +43,13 @@ def test_batches_are_timed_and_compared_with_the_processors(small):
         assert row["bytes_per_run"] > 15**2 * 8
         assert row["largest_difference"] < gpu.AGREEMENT
     assert of["processors"]["xla"] > 0
+    assert found["left_out"] == []
+    assert {"4", "6", "processors_xla"} <= found["studies"].keys()
+    assert found["recommended"]["relative"] > 0
+    assert found["float32_beside_float64"]["whole_products"]["nees_of_no_covariance"] == 0
     page = (small.docs / "speed.md").read_text()
-    assert "A takes" in page
     assert "| 6 runs at once |" in page
+    assert "on the device, chunks of 4 | 6 |" in page
 
 
 @pytest.mark.slow
@@ -62,24 +63,23 @@ def test_other_numbers_than_the_cpu_s_end_in_an_error_when_all_is_measured(small
 
 
 @pytest.mark.parametrize(
-    ("limits", "why"),
+    ("fields", "left", "why"),
     [
-        pytest.param({"call_seconds": 1e-9}, "a call would take", marks=pytest.mark.slow),
-        ({}, "needs about"),
+        ({"bytes_per_run": 2**30}, 99.0, "needs about 6 GiB of 4"),
+        ({"seconds": 9.0}, 99.0, "a call would take about 27 s"),
+        ({"compile_seconds": 9.0}, 9.0, "no time left"),
+        ({}, 9.0, None),
     ],
 )
-def test_what_is_too_large_is_left_out_and_it_is_said_why(small, monkeypatch, limits, why):
-    monkeypatch.setattr(gpu, "compiler", lambda: None)  # XLA alone
-    if not limits:
-        monkeypatch.setattr(gpu, "memory_of", lambda device: 2**10)
-    dataclasses.replace(small, **limits)()
-    found = json.loads(small.out.read_text())["filters"]["A"]["float64"]["device"]
-    assert found["2"]["microseconds_per_step"] > 0
-    assert found["2"]["largest_difference"] < gpu.AGREEMENT
-    assert why in found["6"]
-    page = (small.docs / "speed.md").read_text()
-    assert "| 6 runs at once | – |" in page
-    assert "A dash stands where" in page
+def test_what_is_too_large_is_left_out_and_it_is_said_why(monkeypatch, fields, left, why):
+    monkeypatch.setattr(gpu, "memory_of", lambda device: 2**32)
+    last = {"runs": 2, "seconds": 0.1, "bytes_per_run": 9, "compile_seconds": 1.0} | fields
+    assert OnGpu().too_much(last, 6, jax.devices()[0], lambda: left) == why
+    row = {"microseconds_per_step": 1.0, "compile_seconds": 2.0, "largest_difference": 0.0}
+    of = {"device": {"2": row, "6": why or "no time left"}}
+    told = shown({"filters": {"A": {"float64": of}}, "left_out": [], "processors": 3})
+    assert "| 2 runs at once | 1 |" in told
+    assert "| 6 runs at once | – |" in told
 
 
 def test_after_its_time_nothing_more_is_begun(small):
@@ -87,36 +87,3 @@ def test_after_its_time_nothing_more_is_begun(small):
     left = json.loads(small.out.read_text())["left_out"]
     assert left == [f"{name}: no time left" for name in ("A, float64", "studies", "recommended")]
     assert "Not measured yet." in (small.docs / "speed.md").read_text()
-
-
-@pytest.mark.slow
-def test_studies_and_products_of_single_precision_are_measured_too(small):
-    """Keys of the page that only studies and the mixture fill in."""
-    whole = dataclasses.replace(
-        small, dtypes=("float64", "float32"), batches=(2,), studies=(4, 6), chunk=4, study_steps=2,
-        mixture_runs=2,
-    )  # fmt: skip
-    whole()
-    found = json.loads(small.out.read_text())
-    assert found["left_out"] == []
-    assert {"4", "6", "processors_xla"} <= found["studies"].keys()
-    assert found["recommended"]["relative"] > 0
-    assert found["float32_beside_float64"]["whole_products"]["nees_of_no_covariance"] == 0
-    assert "on the device, chunks of 4 | 6 |" in shown(found)
-
-
-def test_the_page_has_the_numbers_on_disk():
-    folder = Path(__file__).resolve().parents[2]
-    results = json.loads((folder / "benchmarks/results/gpu.json").read_text())
-    table = f"{BEGIN}\n\n{shown(results)}\n\n{END}"
-    assert table in (folder / "docs/speed.md").read_text()
-
-
-def test_without_a_gpu_one_line_says_so(monkeypatch, capsys):
-    def devices(kind=None):
-        raise RuntimeError("Unknown backend: 'gpu'")
-
-    monkeypatch.setattr(jax, "devices", devices)
-    with pytest.raises(SystemExit, match=r"^no GPU is there for JAX.*--device cpu") as error:
-        OnGpu()()
-    assert "\n" not in str(error.value)

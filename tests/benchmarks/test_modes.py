@@ -8,8 +8,7 @@ import modes as told
 import numpy as np
 import pytest
 from cases import Case, close, quick_jit
-from modes import Modes, followed, given_scale, modes_of_run
-from modes_figure import Worlds, plot_modes, worlds_of
+from modes import Modes, Worlds, followed, given_scale, modes_of_run, plot_modes
 
 pytestmark = pytest.mark.laboratory
 
@@ -22,7 +21,14 @@ def standstill():
     return Case("standstill", 1, landmarks=6, steps=STEPS)
 
 
-# --- which is which -----------------------------------------------------------------------------
+@cache
+def through():
+    """The modes of one run, compiled quickly."""
+    slam, of = standstill().filter("scale_gauge+mixture3+rest4"), standstill()
+    quick = quick_jit(lambda slam, run: told._through(slam, of.room, run))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(told, "_compiled", lambda slam, room, run: quick(slam, run))
+        return modes_of_run(slam, of.room, of.run(0))
 
 
 def modes_with(*frames):
@@ -49,38 +55,18 @@ def test_a_mode_keeps_its_number_when_others_overtake_it_and_when_its_scale_chan
         {left: 0.5, (0.0, 0.1): 0.3, right: 0.2},
     )
     assert followed(modes).tolist() == [[0, 1, -1], [1, 0, -1], [1, -1, -1], [0, 2, 1]]
-
-
-def test_modes_that_move_the_same_way_are_one():
-    modes = modes_with({tuple(LEFT): 0.6, tuple(2 * LEFT): 0.4})
+    modes = modes_with({left: 0.6, tuple(2 * LEFT): 0.4})
     assert followed(modes).tolist() == [[0, 0]]
 
 
-# --- what is told -------------------------------------------------------------------------------
-
-
-@cache
-def through():
-    """The modes of one run, compiled quickly."""
-    slam, of = standstill().filter("scale_gauge+mixture3+rest4"), standstill()
-    quick = quick_jit(lambda slam, run: told._through(slam, of.room, run))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(told, "_compiled", lambda slam, room, run: quick(slam, run))
-        return modes_of_run(slam, of.room, of.run(0))
-
-
-def test_the_modes_of_a_run_end_where_frames_are_merged():
+def test_the_modes_of_a_run_explain_its_pixels_until_frames_are_merged():
     """The window of four frames after frame 0 is full in the fourth."""
-    modes = through()
+    modes, points = through(), np.asarray(standstill().run(0).points)
     assert modes.weights.shape == (WINDOW - 1, 3)
+    assert np.isfinite(modes.nees).all()
     assert modes.nees.shape == (STEPS,)
     np.testing.assert_allclose(modes.weights.sum(axis=1), 1.0, rtol=1e-9)
     assert (np.diff(modes.weights, axis=1) <= 0).all()
-    assert np.isfinite(modes.nees).all()
-
-
-def test_every_mode_begins_at_the_origin_and_explains_the_pixels():
-    modes, points = through(), np.asarray(standstill().run(0).points)
     azimuths = np.arctan2(points[:, 0], points[:, 1])
     for k, i in np.argwhere(modes.weights > 0.01):
         path = modes.paths[k, i]
@@ -99,15 +85,10 @@ def test_the_scale_given_is_conditioned_on():
     n = len(state.covariance)
     root = np.random.default_rng(0).standard_normal((n, n))
     P = root @ root.T + np.eye(n)
-    given = quick_jit(given_scale)(replace(state, covariance=jnp.asarray(P)))
-    left = np.asarray(given.covariance)
+    left = np.asarray(given_scale(replace(state, covariance=jnp.asarray(P))).covariance)
     at = state.core.part("log_scale").start
-    others = np.delete(np.arange(n), at)
-    close(
-        left[np.ix_(others, others)],
-        np.linalg.inv(np.linalg.inv(P)[np.ix_(others, others)]),
-        1e-9,
-    )
+    others = np.ix_(*2 * [np.delete(np.arange(n), at)])
+    close(left[others], np.linalg.inv(np.linalg.inv(P)[others]), 1e-9)
     assert np.abs(left[at]).max() < 1e-9 * np.abs(P).max()
 
 
@@ -117,75 +98,40 @@ def test_a_filter_without_a_start_from_rest_is_refused():
         modes_of_run(of.filter("scale_gauge"), of.room, of.run(0))
 
 
-# --- the figure ---------------------------------------------------------------------------------
-
-
 def worlds():
     """Left dies after the second of four frames; the filter is in it."""
     left, right = tuple(LEFT), tuple(RIGHT)
-    alive = {right: 0.6, left: 0.4}
-    modes = modes_with(alive, {left: 0.75, right: 0.25}, {right: 1.0}, {right: 1.0})
+    modes = modes_with({right: 0.6, left: 0.4}, {left: 0.75, right: 0.25}, {right: 1.0}, {right: 1})
     steps = np.arange(5)[:, None]
     return Worlds(
+        modes,
+        followed(modes),
         truth=steps * RIGHT,
         points=np.array([[-1.0, 4.0], [0.5, 6.0], [1.0, 9.0]]),
-        weights=modes.weights,
-        numbers=followed(modes),
-        paths=modes.paths,
-        landmarks=modes.landmarks,
-        covariances=modes.covariances,
         filtered=1.1 * (steps * LEFT)[1:],
         filter_name="mine",
         rate=30.0,
     )
 
 
-def said(figure):
-    """What is written on it, row by row."""
-    return [[text.get_text() for axes in row.axes for text in axes.texts] for row in figure.subfigs]
-
-
-def drawn(axes):
-    """The points of every line."""
-    return [np.asarray(line.get_xydata()) for line in axes.lines]
-
-
 def test_the_figure_shows_who_lives_when_and_who_is_still_with_the_dead():
-    figure = plot_modes(worlds(), (1, 2, 4))
-    right, left, bands = said(figure)
-    assert right == ["60%", "25%", "100%"]
-    assert left == ["dead since frame 3;\nmine is still here", "40%", "75%"]
-    assert bands == ["goes right", "goes left"]
-    assert [row.get_supylabel() for row in figure.subfigs[:2]] == [
-        "the camera goes right",
-        "the camera goes left",
+    data = worlds()
+    figure = plot_modes(data, (1, 2, 4))
+    said = [[x.get_text() for axes in row.axes for x in axes.texts] for row in figure.subfigs]
+    assert said == [
+        ["60%", "25%", "100%"],
+        ["dead since frame 3;\nmine is still here", "40%", "75%"],
+        ["goes right", "goes left"],
     ]
     titles = [axes.get_title() for axes in figure.subfigs[0].axes[:3]]
     assert titles == ["frame 1, 0.03 s", "frame 2, 0.07 s", "frame 4, 0.13 s"]
-
-
-def test_the_paths_and_landmarks_of_the_figure_are_those_of_the_modes():
-    data = worlds()
-    row = plot_modes(data, (2,)).subfigs[0]
-    above, below = row.axes
-    way = data.paths[1, 1, :3]
-    assert any(line.shape == way.shape and np.allclose(line, way) for line in drawn(below))
-    camera, (azimuth, inverse) = data.paths[1, 1, 2], data.landmarks[1, 1, 0]
+    above, below = (
+        [np.asarray(line.get_xydata()) for line in figure.subfigs[0].axes[i].lines] for i in (1, 4)
+    )
+    way = data.modes.paths[1, 1, :3]
+    assert any(line.shape == way.shape and np.allclose(line, way) for line in below)
+    camera, (azimuth, inverse) = data.modes.paths[1, 1, 2], data.modes.landmarks[1, 1, 0]
     point = camera + np.array([np.sin(azimuth), np.cos(azimuth)]) / inverse
-    assert any(line.shape == (1, 2) and np.allclose(line, point) for line in drawn(above))
-
-
-def test_frames_without_modes_are_refused():
+    assert any(line.shape == (1, 2) and np.allclose(line, point) for line in above)
     with pytest.raises(ValueError, match="known in frames 1 to 4"):
-        plot_modes(worlds(), (5, 9))
-
-
-def test_a_run_is_seen_from_above():
-    of, modes = standstill(), through()
-    path = np.asarray(of.run(0).poses.translation())[1:]
-    seen = worlds_of(of.run(0), modes, path, "mine", 30.0)
-    np.testing.assert_array_equal(seen.truth[1:], path)
-    np.testing.assert_array_equal(seen.filtered, path)
-    np.testing.assert_array_equal(seen.paths, modes.paths)
-    figure = plot_modes(seen, (1, 3))
-    assert figure.subfigs[-1].axes[0].get_xlabel() == "frame"
+        plot_modes(data, (5, 9))

@@ -30,19 +30,16 @@ def test_a_mutant_is_the_source_with_one_line_changed():
 
 @pytest.mark.slow
 def test_they_are_drawn_of_every_room_by_a_seed():
-    """A room that is left out; the whole package is read three times."""
+    """A room that is left out; the whole package is read twice."""
     chosen = mutants.drawn(60, 1)
-    assert chosen == mutants.drawn(60, 1) != mutants.drawn(60, 2)
-    assert len(chosen) == len(set(chosen)) == 60
+    assert chosen == mutants.drawn(60, 1)
+    assert len(set(chosen)) == 60
     assert {"filters", "tracking", "evaluation"} <= {mutants._room(site.path) for site in chosen}
 
 
 @pytest.mark.parametrize(
     ("body", "told"),
-    [
-        pytest.param("assert x > 0", "survived", marks=pytest.mark.slow),
-        ("assert x == 3", "FAILED"),
-    ],
+    [pytest.param("assert x > 0", "survived", marks=pytest.mark.slow), ("assert x == 3", "FAILED")],
 )
 def test_a_mutant_is_caught_by_a_test_that_fails(tmp_path, body, told):
     path = tmp_path / "jaxslam" / "linalg.py"

@@ -1,7 +1,5 @@
 """Tests of recorded tracks: how they are read, and how they share a filter's slots."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracks import read, window, windows
 
-from jaxslam.consistency import run_through
-from jaxslam.filters.words import make_filters
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Room, gone, scenario, sightings
+from jaxslam.simulation import Room, gone, sightings
 
 SIGHTS = {0: range(0, 4), 1: range(0, 6), 2: range(0, 2), 3: range(1, 6), 4: range(2, 6)}
 """The frames of each track, of a drive of six."""
@@ -104,52 +100,28 @@ def test_a_window_begins_anew_and_its_poses_are_relative(drive):
     np.testing.assert_array_equal(batch.controls[:, 0], np.diff(drive.times)[[0, 1, 2]])
 
 
-def test_a_filter_goes_through_a_drive(drive):
-    told = scenario("handheld", rate=10.0)
-    slam = next(iter(make_filters(told, ["robocentric"], ["inverse_scaling"]).values()))
-    run = window(drive, 0, 5, landmarks=3)
-    in_map = jax.jit(
-        lambda run: run_through(
-            slam, Room(3, 2, 3, 2), run, lambda state, innovation, frame: slam.in_map(state)
-        )[1]
-    )(run)
-    np.testing.assert_array_equal(in_map, np.asarray(run.visible)[1:])
-
-
-@pytest.mark.parametrize(("start", "steps", "count"), [(-1, 3, 2), (3, 3, 2), (0, 0, 2), (0, 3, 0)])
-def test_a_window_is_in_the_drive(drive, start, steps, count):
-    with pytest.raises(ValueError, match=r"are not in 6 frames"):
-        window(drive, start, steps, landmarks=count)
-
-
-def test_what_holds_no_tracks_is_refused(tmp_path, drive):
-    with pytest.raises(ValueError, match=r"tracks\.npz does not exist"):
-        read(tmp_path / "none")
-    with pytest.raises(ValueError, match="at least one window is accepted, not 0"):
-        windows(drive, 3, 0)
+def test_what_holds_no_tracks_or_no_window_is_refused(tmp_path, drive):
+    for start, steps, count in ((-1, 3, 2), (3, 3, 2), (0, 0, 2), (0, 3, 0)):
+        with pytest.raises(ValueError, match=r"are not in 6 frames"):
+            window(drive, start, steps, landmarks=count)
     (tmp_path / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
     with pytest.raises(ValueError, match="has 1 true poses of 6 frames"):
         read(tmp_path)
     np.savez(tmp_path / "tracks.npz", frame=np.zeros(1))
     with pytest.raises(ValueError, match="lacks track, pixel"):
         read(tmp_path)
-    (tmp_path / "tracks.npz").write_text("no")
-    with pytest.raises(ValueError, match="not an npz file of numbers"):
-        read(tmp_path)
 
 
 def sampson(run, camera, between):
     """Distances of pixels from the epipolar line of some frames before, pixels."""
-    T = np.asarray(run.poses.as_matrix())
+    T, found = np.asarray(run.poses.as_matrix()), []
     fx, fy, cx, cy = np.asarray(camera.intrinsics)
     K_inv = np.linalg.inv([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    found = []
     for k in range(between, len(T)):
-        both = np.asarray(run.visible[k] & run.visible[k - between])
-        same = both & ~np.asarray(run.new)[k - between + 1 : k + 1].any(axis=0)
+        seen = np.asarray(run.visible[k] & run.visible[k - between])
+        same = seen & ~np.asarray(run.new)[k - between + 1 : k + 1].any(axis=0)
         E = np.linalg.inv(T[k]) @ T[k - between]
-        x, y, z = E[:3, 3]
-        F = K_inv.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ E[:3, :3] @ K_inv
+        F = K_inv.T @ np.cross(E[:3, 3], E[:3, :3].T).T @ K_inv
         a, b = (
             np.column_stack([np.asarray(run.measured)[i][same], np.ones(same.sum())])
             for i in (k - between, k)
@@ -166,7 +138,4 @@ def test_the_tracks_of_real_drives_agree_with_their_poses(shared_data):
     run = window(data, 0, 200)
     assert 0.1 < np.median(sampson(run, data.camera, 1)) < 0.2
     assert 0.2 < np.median(sampson(run, data.camera, 5)) < 0.45
-    # With its motion turned round they do not.
-    wrong = replace(run, poses=jax.vmap(lambda T: T.inverse())(run.poses))
-    assert np.median(sampson(wrong, data.camera, 5)) > 1
     assert jnp.sum(run.visible, axis=1).max() == 40
