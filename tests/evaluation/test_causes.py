@@ -53,7 +53,7 @@ def moved(R, t):
     return S.moved(T), S.block @ P @ S.block.T
 
 
-def half():
+def half_angles():
     T, P, true = right(correlation=0.0)
     scale = np.where(np.arange(6) < 3, 1.0, 0.5)
     return T, scale[:, None] * P * scale, true
@@ -88,9 +88,6 @@ FAULTS = {
     "two bodies, turned": (
         (T, P, TRUTH @ body(np.radians(40))), "two bodies", "a constant rotation of 39.",
     ),
-    "two bodies, an arm": (
-        (T, P, TRUTH @ body(0, (0.3, 0.0, -0.4))), "two bodies", "a lever arm of 0.5",
-    ),
     # As large as σ: no error is large, but all runs have the same.
     "two bodies, a short arm": (
         (T, P, TRUTH @ body(0, (0.06, 0.0, -0.08))), "two bodies", "a lever arm of 0.1",
@@ -99,7 +96,7 @@ FAULTS = {
         (T, P, TRUTH @ body(np.radians(120), (0.0, 0.0, 1.0))), "two bodies", "a lever arm of",
     ),
     "another world": ((*moved(yaw(70), (9.0, 2.0, 0.0)), TRUTH), "not in one world", "by 7"),
-    "half angles": (half(), "half angles", "angle=half"),
+    "half angles": (half_angles(), "half angles", "angle=half"),
 }  # fmt: skip
 
 
@@ -119,10 +116,9 @@ def test_a_fault_between_the_logs_is_named_with_the_nees_without_it(logs, what, 
     assert found.headline.startswith("no verdict: ")
 
 
-@pytest.mark.parametrize("number", [5, 38])
-def test_half_angles_are_named_where_intervals_are_wide(number):
-    """Of 6 and of 29 runs, with errors that are correlated in time."""
-    said, found = benchmark.judged("half angles", 1.0, number)
+def test_half_angles_are_named_where_intervals_are_wide():
+    """Of 6 runs, with errors that are correlated in time."""
+    said, found = benchmark.judged("half angles", 1.0, 5)
     assert said == "named"
     assert found.verdict["word"] == "cannot tell"
 
@@ -169,51 +165,40 @@ def test_a_run_that_is_logged_twice_is_named_and_one_that_begins_alike_is_not():
     assert not [x for x in evaluate_poses(alike, P, TRUTH, SPLIT).mistakes if "twice" in x.what]
 
 
-def drifting(seed):
+def drifting():
     """A filter that does not know that it drifts, in position and heading, in one run each way."""
-    T, P, true = right(seed=seed)
-    steps = np.linspace(0, 1, STEPS)[:, None]
-    rng = np.random.default_rng(seed + 100)
+    T, P, true = right()
+    rng, steps = np.random.default_rng(100), np.linspace(0, 1, STEPS)[:, None]
     e = steps * np.array([0.4, 0.4, 0.1, 0, 0, 0.1]) * rng.normal(size=(RUNS, 1, 6))
     return T, P, displaced(true, e, SPLIT)
 
 
-def turned_at_first(seed):
+def turned_at_first():
     """A wrong heading at the start, which turns all of a run about its first pose."""
-    T, P, true = right(seed=seed)
-    start = true[:, :1]
-    turn = np.tile(np.eye(4), (RUNS, 1, 1, 1))
-    heading = np.random.default_rng(seed).normal(size=RUNS)
-    turn[:, 0, :3, :3] = Rotation.from_euler("z", 0.06 * heading[:, None]).as_matrix()
+    T, P, true = right()
+    start, turn = true[:, :1], np.tile(np.eye(4), (RUNS, 1, 1, 1))
+    heading = 0.06 * np.random.default_rng(0).normal(size=RUNS)
+    turn[:, 0, :3, :3] = Rotation.from_euler("z", heading[:, None]).as_matrix()
     return T, P, start @ turn @ np.linalg.inv(start) @ true
 
 
-def wrong_heading(seed):
-    """σ of the heading is too small by three, of roll and pitch by 1.2."""
-    T, rng = paths(seed), np.random.default_rng(seed)
-    white = rng.normal(size=(STEPS + 1, RUNS, 6))
-    errors = SIGMA * [1, 1, 1, 1.2, 1.2, 3] * np.swapaxes(correlated(white, 0.9)[:-1], 0, 1)
-    P = np.broadcast_to(np.diag(SIGMA**2), (RUNS, STEPS, 6, 6))
-    return T, P, displaced(T, errors, SPLIT)
-
-
 WRONG = {
-    "the heading": wrong_heading,
-    **{f"σ, {x}": partial(right, x) for x in (1.3, 2.0, 3.0)},
-    **{f"σ, {x}, of a level robot": partial(right, x, tilt=0.0) for x in (1.3, 3.0)},
+    "σ of the heading": partial(right, np.array([1, 1, 1, 1.2, 1.2, 3])),
+    "σ": partial(right, 1.3),
+    "σ, by much": partial(right, 3.0),
+    "σ of a level robot": partial(right, 1.3, tilt=0.0),
     "drift": drifting,
-    "wrong headings": turned_at_first,
+    "headings at the start": turned_at_first,
 }
 
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
 def test_a_filter_that_is_wrong_itself_has_no_other_cause(wrong):
-    for seed in range(2):
-        logs = wrong(seed=seed)
-        for align in ("none", "yaw"):
-            found = evaluate_poses(*logs, SPLIT, align=align)
-            assert not found.mistakes, found.mistakes
-        assert evaluate_poses(*logs, SPLIT).verdict["word"] in ("over-confident", "lost")
+    logs = wrong()
+    for align in ("none", "yaw"):
+        found = evaluate_poses(*logs, SPLIT, align=align)
+        assert not found.mistakes, found.mistakes
+        assert align == "yaw" or found.verdict["word"] in ("over-confident", "lost")
 
 
 @pytest.mark.parametrize("fault", ["none", "clock", "doubled stamps", "column by column"])

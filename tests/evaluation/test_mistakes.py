@@ -22,8 +22,7 @@ def correlated(runs=20, steps=40, n=3, correlation=0.97, seed=0):
     now, result = rng.normal(size=(runs, n)), np.empty((runs, steps, n))
     for step in range(steps):
         result[:, step] = now
-        new = rng.normal(size=now.shape)
-        now = correlation * now + np.sqrt(1 - correlation**2) * new
+        now = correlation * now + np.sqrt(1 - correlation**2) * rng.normal(size=now.shape)
     return result
 
 
@@ -49,15 +48,10 @@ def said(errors, covariances, names=NAMES):
     return found.headline
 
 
-MANY = quick_rows(1, [range(2), range(2, 30)])
-"""Seeds of which the first are quick: the others would find what is rare."""
-
-
 # --- they are named -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("names", [NAMES, ()])
-@pytest.mark.parametrize("turns", [1, -1, 2])
+@pytest.mark.parametrize(("names", "turns"), [(NAMES, 1), ((), -1), (NAMES, 2)])
 def test_an_angle_that_is_not_wrapped_is_named(names, turns):
     name = names[2] if names else "3"
     e, P = right()
@@ -80,19 +74,17 @@ def test_an_angle_in_degrees_is_wrapped_at_360():
     assert said(e, P) == "no verdict: an angle is not wrapped (heading)"
 
 
-@pytest.mark.parametrize("seeds", quick_rows(1, [range(1), range(1, 10)]))
 @pytest.mark.parametrize(("names", "name"), [(NAMES, "heading"), ((), "3")])
 @pytest.mark.parametrize(("runs", "correlation"), [(60, 0.97), (10, 0.99)])
-def test_degrees_for_radians_are_named(names, name, seeds, runs, correlation):
+def test_degrees_for_radians_are_named(names, name, runs, correlation):
     """Of few runs that hardly change, too: the interval of their scatter has no lower end."""
-    for seed in seeds:
-        e, P = right(runs=runs, correlation=correlation, seed=seed)
-        expected = f"no verdict: degrees instead of radians ({name})"
-        assert said(e * DEGREES, P, names) == expected
-        assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
+    e, P = right(runs=runs, correlation=correlation)
+    expected = f"no verdict: degrees instead of radians ({name})"
+    assert said(e * DEGREES, P, names) == expected
+    assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
+    if runs == 60:
         only = slice(2, 3)
-        if runs == 60:
-            assert "degrees" in said((e * DEGREES)[..., only], P[..., only, only], names[2:])
+        assert "degrees" in said((e * DEGREES)[..., only], P[..., only, only], names[2:])
 
 
 def test_degrees_are_named_of_innovations():
@@ -105,17 +97,15 @@ def test_degrees_are_named_of_innovations():
 
 def test_degrees_are_named_in_poses_too(tmp_path):
     """A covariance file in degrees that does not say so."""
-    steps, rng = 60, np.random.default_rng(0)
-    sigma = np.array([0.1, 0.1, 0.1, 0.01, 0.02, 0.01])
+    steps, sigma = 60, np.array([0.1, 0.1, 0.1, 0.01, 0.02, 0.01])
     truth = np.tile(np.eye(4), (12, steps, 1, 1))
     truth[..., 0, 3] = np.arange(steps) / 10
-    e = sigma * rng.normal(size=(12, steps, 6))
+    e = sigma * np.random.default_rng(0).normal(size=(12, steps, 6))
     estimate = truth.copy()
     estimate[..., :3, 3] -= e[..., :3]
     back = Rotation.from_rotvec(-e[..., 3:].reshape(-1, 3)).as_matrix()
     estimate[..., :3, :3] = back.reshape(12, steps, 3, 3)
-    in_degrees = np.diag(sigma * np.repeat([1, 180 / np.pi], 3)) ** 2
-    P = np.tile(in_degrees, (12, steps, 1, 1))
+    P = np.tile(np.diag(sigma * np.repeat([1, 180 / np.pi], 3)) ** 2, (12, steps, 1, 1))
     write_runs(tmp_path, estimate, P, truth, Convention("split", "mixed"))
     found = jaxslam.evaluate_log(tmp_path)
     assert found.headline == "no verdict: degrees instead of radians (rx, ry, rz)"
@@ -124,15 +114,17 @@ def test_degrees_are_named_in_poses_too(tmp_path):
 
 
 @pytest.mark.parametrize("runs", [1, 3, 20])
-@pytest.mark.parametrize("names", [NAMES, ()])
-def test_arrays_of_steps_and_runs_are_named(runs, names):
+def test_arrays_of_steps_and_runs_are_named(runs):
     e, P = (np.swapaxes(x, 0, 1) for x in right(runs=runs, steps=60))
-    assert said(e, P, names) == "no verdict: runs and steps appear to be swapped"
+    for names in (NAMES, ()):
+        assert said(e, P, names) == "no verdict: runs and steps appear to be swapped"
 
 
 # --- and nothing else is ------------------------------------------------------------------------
 
 SIZES = [(1, 1), (1, 50), (2, 50), (3, 3), (5, 30), (8, 1), (10, 10), (20, 2), (30, 1), (30, 30)]
+SEEDS = pytest.mark.parametrize("seeds", quick_rows(1, [range(2), range(2, 20)]))
+"""The first are quick: the others would find what is rare."""
 
 
 @pytest.mark.slow
@@ -148,7 +140,7 @@ def test_right_data_raise_no_false_alarm(size, correlation):
             assert said(e, P, NAMES[3 - n :] if seed % 2 else ()) == "", (runs, steps, seed)
 
 
-@pytest.mark.parametrize("seeds", MANY)
+@SEEDS
 @pytest.mark.parametrize("factor", quick_rows(2, [0.3, 10.0, 0.1, 3.0, 20.0]))
 def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor, seeds):
     for seed in seeds:
@@ -158,30 +150,22 @@ def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor, se
         assert said(e * [factor, factor, 1], P) == ""
 
 
-@pytest.mark.parametrize("seeds", MANY)
+@SEEDS
 def test_lost_runs_are_not_taken_for_ones_in_degrees(seeds):
-    """Where the mean NEES of all runs is just what degrees would make it."""
-    for seed in seeds[:10]:
-        e, P = right(seed=seed)
-        lost = np.ones((20, 1, 3))
-        lost[:6, :, 2] = 180 / np.pi * np.sqrt(20 / 6)
-        assert 29 < jaxslam.evaluate(lost * e, P).axis_verdict(2)["sigma_factor"] < 115
-        assert said(lost * e, P) == ""
-        assert said(lost * e, P, ()) == ""
+    """Where the mean NEES of all runs is just what degrees would make it; and where all of σ is
+    too small besides, of axes without names."""
+    lost = np.ones((20, 1, 3))
+    lost[:6, :, 2] = 180 / np.pi * np.sqrt(20 / 6)
+    small = np.full((40, 1, 3), 30.0)
+    small[[3, 17]] *= 12
+    for seed in seeds:
+        for factor, names, correlation in ((lost, NAMES, 0.97), (lost, (), 0.97), (small, (), 0.0)):
+            e, P = right(runs=len(factor), seed=seed, correlation=correlation)
+            assert 29 < jaxslam.evaluate(factor * e, P).axis_verdict(2)["sigma_factor"] < 115
+            assert said(factor * e, P, names) == ""
 
 
-@pytest.mark.parametrize("seeds", MANY)
-def test_where_all_of_sigma_is_too_small_and_some_runs_are_lost_it_is_not_the_unit(seeds):
-    """Of axes without names, of which none is right."""
-    for seed in seeds[:10]:
-        e, P = right(runs=40, seed=seed, correlation=0.0)
-        e[[3, 17]] *= 12
-        e *= 30
-        assert 29 < jaxslam.evaluate(e, P).axis_verdict(2)["sigma_factor"] < 115
-        assert said(e, P, ()) == ""
-
-
-@pytest.mark.parametrize("seeds", MANY)
+@SEEDS
 def test_positions_anywhere_are_no_angles(seeds):
     """Of a filter whose σ is 100 times too small, errors of metres, also of 6.28 m."""
     for seed in seeds:
@@ -199,17 +183,13 @@ def test_where_all_of_sigma_is_too_small_by_57_it_is_not_the_unit_of_angles():
     assert said(57.3 * e, P) == ""
 
 
-@pytest.mark.parametrize("seeds", MANY)
-def test_a_bias_that_all_runs_share_does_not_make_them_steps(seeds):
-    for seed in seeds[:20]:
+@SEEDS
+def test_a_bias_that_all_runs_share_or_an_order_by_scatter_does_not_make_them_steps(seeds):
+    for seed in seeds:
         e, P = right(seed=seed, correlation=0.9)
         shared = correlated(1, 40, 3, 0.99, seed=1000 + seed)
         assert said(e + 3 * SIGMA * shared, P) == ""
-
-
-def test_runs_that_are_ordered_by_their_scatter_are_still_runs():
-    e, P = right()
-    assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
+        assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])

@@ -26,7 +26,7 @@ def files(folder, true=slice(None), own=slice(None), late=0.0):
     return folder
 
 
-@pytest.mark.parametrize("true", [slice(None), slice(0, None, 3), slice(1, None, 2)])
+@pytest.mark.parametrize("true", [slice(None), slice(0, None, 3)])
 def test_a_truth_at_other_stamps_is_interpolated(true, tmp_path):
     found = evaluate_log(files(tmp_path, true))
     there = found.logged[0]
@@ -92,7 +92,7 @@ def test_where_the_truth_is_rare_its_stamps_are_those_that_are_compared(tmp_path
     assert "compared at the stamps of the truth" in str(found)
 
 
-@pytest.mark.parametrize("value", [-1.0, 1e12, 1.797e308, np.inf])
+@pytest.mark.parametrize("value", [-1.0, 1.797e308, np.inf])
 def test_axes_of_unknown_variance_have_no_degree_of_freedom(value, tmp_path):
     T, P, truth, nees = planar(runs=1, steps=30)
     times, P = np.arange(30) / 10, P[0].copy()
