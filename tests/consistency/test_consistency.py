@@ -270,9 +270,6 @@ def test_filters_meet_the_same_worlds():
 def test_sizes_that_make_no_sense_are_refused(sizes, message):
     with pytest.raises(ValueError, match=message):
         check_sizes(*sizes)
-    runs, seed, dtype, chunk = sizes
-    with pytest.raises(ValueError, match=message):
-        jaxslam.monte_carlo(SCENARIO, "robocentric", runs=runs, seed=seed, dtype=dtype, chunk=chunk)
 
 
 # --- the summary ---------------------------------------------------------------------------------

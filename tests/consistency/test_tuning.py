@@ -11,8 +11,9 @@ import pytest
 
 import jaxslam
 from jaxslam.consistency import draw, fit_of, log_likelihood, of_simulation
+from jaxslam.consistency.tuning import NOISE, _Search
 
-MOTION = jaxslam.Odometry([0.02, 0.0, 0.01])
+MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
 SENSOR = jaxslam.RangeBearing([0.1, 0.02])
 LOGS, STEPS = 4, 40
 
@@ -36,21 +37,18 @@ def slam(motion=MOTION, sensor=SENSOR, **pieces):
 
 @pytest.fixture(scope="module")
 def tuned(logs):
-    """Of a filter of which every σ is wrong by factors of 2 to 2.5, but for one of 0."""
-    wrong = slam(jaxslam.Odometry([0.04, 0.0, 0.02]), jaxslam.RangeBearing([0.25, 0.01]))
-    priors = {"motion.noise_sigma": (0.02, 4)}
-    return jaxslam.tune(wrong, logs[:LOGS], held_out=logs[LOGS:], priors=priors)
+    """Of a filter of which every σ is wrong by factors of 2 to 2.5."""
+    wrong = slam(jaxslam.Odometry([0.04, 0.015, 0.02]), jaxslam.RangeBearing([0.25, 0.01]))
+    return jaxslam.tune(wrong, logs[:LOGS], held_out=logs[LOGS:])
 
 
-def test_every_wrong_noise_is_found_within_its_sigma_and_a_sigma_of_zero_stays(tuned):
+def test_every_wrong_noise_is_found_within_its_sigma(tuned):
     assert tuned.converged
-    assert (tuned.found["motion.noise_sigma"][1], tuned.sigma["motion.noise_sigma"][1]) == (0, 0)
     truth = {"motion.noise_sigma": MOTION.noise_sigma, "sensor.sigma": SENSOR.sigma}
     for name, values in truth.items():
-        there = np.array(values) > 0
-        off = (tuned.found[name] - values)[there] / tuned.sigma[name][there]
+        off = (tuned.found[name] - values) / tuned.sigma[name]
         assert np.all(np.abs(off) < 3.5), name
-        assert np.all(tuned.sigma[name][there] < 0.25 * np.array(values)[there]), name
+        assert np.all(tuned.sigma[name] < 0.25 * np.array(values)), name
     assert tuned.word == "noise"
     told = str(tuned)
     assert told.startswith("The noise below explains the innovations")
@@ -67,20 +65,35 @@ def test_the_tuned_filter_is_right_where_the_given_one_was_not(tuned):
     np.testing.assert_array_equal(tuned.slam.sensor.sigma, tuned.found["sensor.sigma"])
 
 
-def test_a_bias_that_no_noise_explains_is_a_wrong_model_and_bounds_hold(logs):
-    """The odometry turns by 0.05 rad too little in every step."""
+def test_a_bias_that_no_noise_explains_is_a_wrong_model(tuned, logs):
+    """The odometry turns by 0.05 rad too little in every step; its σ is as large."""
 
     def turned(log):
         control = log.frames.control - jnp.array([0, 0, 0.05])
         return replace(log, frames=log.frames._replace(control=control))
 
-    names, bounds = ["motion.noise_sigma"], {"motion.noise_sigma": (0.005, 0.03)}
-    start = slam(jaxslam.Odometry([0.02, 0.01, 0.01]))
-    found = jaxslam.tune(start, [turned(log) for log in logs[:2]], names, bounds=bounds)
+    noisy = jaxslam.cast(slam(jaxslam.Odometry([0.02, 0.03, 0.05])), jnp.float64)
+    found = replace(tuned, after=fit_of(noisy, [turned(log) for log in logs[:LOGS]]))
     assert found.word == "model"
     assert "No noise explains" in str(found)
-    assert found.found["motion.noise_sigma"][2] == pytest.approx(0.03, rel=0.02)
-    assert np.isnan(found.sigma["motion.noise_sigma"][2])
+
+
+def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
+    start = slam(jaxslam.Odometry([0.02, 0.0, 0.01]))
+    bounds, priors = {"sensor.sigma": (0.01, 0.5)}, {"motion.noise_sigma": (0.02, 2)}
+    search = _Search.of(start, NOISE, bounds, priors, jaxslam.TuningSettings())
+    np.testing.assert_allclose(search.values(search.first)["motion.noise_sigma"], [0.02, 0, 0.01])
+    np.testing.assert_allclose(search.values(search.first)["sensor.sigma"], [0.1, 0.02])
+    far = search.values(search.first + np.array([0, 9, 0, 99, -99]))
+    assert far["motion.noise_sigma"][1] == 0
+    np.testing.assert_allclose(far["sensor.sigma"], [0.5, 0.01], rtol=1e-6)
+    # In the middle between bounds a σ is that of its logarithm; near one there is none.
+    sigma = search.sigmas(search.first + np.array([0, 0, 0, 99, 0]), 100 * np.eye(5))
+    assert sigma["motion.noise_sigma"] == pytest.approx([0.002, 0, 0.001], rel=0.01)
+    assert np.isnan(sigma["sensor.sigma"]).tolist() == [True, False]
+    # Half of a factor of two is one σ of the prior.
+    cost = search.prior_cost(search.first)
+    assert cost == pytest.approx(0.5 + (np.log(0.02) / np.log(2)) ** 2 / 2, rel=1e-3)
 
 
 @pytest.mark.parametrize(

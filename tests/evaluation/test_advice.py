@@ -33,11 +33,8 @@ def filtered(q=1.0, r=1.0, p=1.0, bias=0.0):
         innovations.append(innovation)
         covariances.append(np.broadcast_to(P, (RUNS, 2, 2)))
         S_all.append(np.broadcast_to(S, (RUNS, 1, 1)))
-    stacked = [np.stack(x, axis=1) for x in (errors, covariances, innovations, S_all)]
-    return (
-        jaxslam.evaluate(*stacked[2:], quantity="NIS"),
-        jaxslam.evaluate(*stacked[:2]),
-    )
+    e, P, z, S = (np.stack(x, axis=1) for x in (errors, covariances, innovations, S_all))
+    return jaxslam.evaluate(z, S, quantity="NIS"), jaxslam.evaluate(e, P)
 
 
 @pytest.mark.parametrize(

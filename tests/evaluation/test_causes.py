@@ -116,13 +116,6 @@ def test_a_fault_between_the_logs_is_named_with_the_nees_without_it(logs, what, 
     assert found.headline.startswith("no verdict: ")
 
 
-def test_half_angles_are_named_where_intervals_are_wide():
-    """Of 6 runs, with errors that are correlated in time."""
-    said, found = benchmark.judged("half angles", 1.0, 5)
-    assert said == "named"
-    assert found.verdict["word"] == "cannot tell"
-
-
 def test_a_lever_arm_that_leaves_most_of_the_errors_is_no_cause():
     """A filter whose σ is too small by eight, of a truth with a short arm: it is over-confident."""
     T, P, true = right(factor=8.0)
@@ -149,9 +142,7 @@ def test_where_verticals_differ_an_alignment_by_yaw_is_named_and_where_not_it_is
         logs = S.moved(T), S.block @ P @ S.block.T, true
         found = evaluate_poses(*logs, SPLIT, align="yaw")
         assert found.headline.startswith(headline)
-        assert [x for x in found.mistakes if "with --align se3 NEES is" in x.told] == [
-            *found.mistakes
-        ]
+        assert all("with --align se3 NEES is" in mistake.told for mistake in found.mistakes)
     # Of the four that yaw aligns a run of twenty poses has 120.
     assert found.nees.mean() == pytest.approx(6 - 4 / STEPS, abs=0.5)
 

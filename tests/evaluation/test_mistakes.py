@@ -9,7 +9,7 @@ from logs import write_runs
 from scipy.spatial.transform import Rotation
 
 import jaxslam
-from jaxslam.evaluation import Convention, sanity_checks
+from jaxslam.evaluation import Convention
 
 NAMES = ("x", "y", "heading")
 SIGMA = np.array([0.1, 0.1, 0.02])
@@ -64,11 +64,7 @@ def test_an_angle_that_is_not_wrapped_is_named(names, turns):
     assert "an angle is not wrapped" in said(e, P, names)
     assert "an angle is not wrapped" in said(e[5:6], P[5:6], names)
     assert "(1)" in said(e[..., 2:], P[..., 2:, 2:], ())
-
-
-def test_an_angle_in_degrees_is_wrapped_at_360():
-    e, P = right()
-    e, P = e * DEGREES, P * DEGREES * DEGREES[:, None]
+    e, P = (right()[0] * DEGREES, right()[1] * DEGREES * DEGREES[:, None])
     assert said(e, P) == ""
     e[3, 12:, 2] -= 360
     assert said(e, P) == "no verdict: an angle is not wrapped (heading)"
@@ -141,7 +137,7 @@ def test_right_data_raise_no_false_alarm(size, correlation):
 
 
 @SEEDS
-@pytest.mark.parametrize("factor", quick_rows(2, [0.3, 10.0, 0.1, 3.0, 20.0]))
+@pytest.mark.parametrize("factor", quick_rows(3, [0.3, 10.0, 57.3, 0.1, 3.0, 20.0]))
 def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor, seeds):
     for seed in seeds:
         e, P = right(seed=seed)
@@ -178,11 +174,6 @@ def test_positions_anywhere_are_no_angles(seeds):
     assert said(e, P) == ""
 
 
-def test_where_all_of_sigma_is_too_small_by_57_it_is_not_the_unit_of_angles():
-    e, P = right(runs=100)
-    assert said(57.3 * e, P) == ""
-
-
 @SEEDS
 def test_a_bias_that_all_runs_share_or_an_order_by_scatter_does_not_make_them_steps(seeds):
     for seed in seeds:
@@ -190,12 +181,3 @@ def test_a_bias_that_all_runs_share_or_an_order_by_scatter_does_not_make_them_st
         shared = correlated(1, 40, 3, 0.99, seed=1000 + seed)
         assert said(e + 3 * SIGMA * shared, P) == ""
         assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])
-def test_an_order_is_told_whatever_the_unit_of_what_is_ordered(unit):
-    walk = unit * np.cumsum(np.random.default_rng(0).normal(size=(12, 5)), axis=0)
-    products = sanity_checks._products(walk - walk.mean(axis=0))
-    assert sanity_checks._by_order(products)
-    shuffled = np.random.default_rng(1).permutation(12)
-    assert not sanity_checks._by_order(products[np.ix_(shuffled, shuffled)])

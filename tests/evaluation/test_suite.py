@@ -270,17 +270,6 @@ def test_a_scenario_that_no_suite_has_is_refused(changes, message, tmp_path):
         write_suite(tmp_path / "suite", [jaxslam.scenario(SMALL, **changes)], runs=1)
 
 
-def test_a_suite_has_a_scenario(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", "--suite", str(tmp_path / "suite"), "--scenario"])
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        "jaxslam: a suite needs at least one scenario; by default it has matched"
-    )
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("told", [[1], {"scenario": {}, "runs": 3}])
 def test_a_file_that_tells_no_scenario_of_a_suite_is_named(told, tmp_path):
     (tmp_path / "mine").mkdir()

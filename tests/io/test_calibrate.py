@@ -50,22 +50,22 @@ def filmed(request, tmp_path_factory):
     """A folder of pictures of a board, a few of them blurred, one without it."""
     board, path = request.param, tmp_path_factory.mktemp(request.param.kind)
     noise = np.random.default_rng(1)
-    for index, (turn, shift) in enumerate(poses(board, 22)):
+    for index, (turn, shift) in enumerate(poses(board, 18)):
         image = rendered(board, turn, shift, noise, blur=4.0 * (index in (5, 11)))
         cv2.imwrite(str(path / f"{index:02d}.png"), image)
     cv2.imwrite(str(path / "99.png"), np.full((CAMERA.height, CAMERA.width), 90, np.uint8))
     return board, path
 
 
-@pytest.mark.parametrize(("seen", "enough"), [(8, True), (7, False)])
-def test_eight_corners_of_a_board_are_enough(seen, enough, monkeypatch):
+def test_eight_corners_of_a_board_are_enough(monkeypatch):
     board, (turn, shift) = BOARDS[1], next(poses(BOARDS[1], 1))
-    points = board.corners[:seen]  # of two rows
-    there = (points @ turn.T + shift) @ CAMERA.matrix.T
-    pixels = (there[:, :2] / there[:, 2:]).astype(np.float32)
-    monkeypatch.setattr(Board, "_find_charuco", lambda *_: (pixels, points))
     image = rendered(board, turn, shift, np.random.default_rng(0))
-    assert (board.find(image) is not None) == enough
+    for seen in (8, 7):  # of two rows
+        points = board.corners[:seen]
+        there = (points @ turn.T + shift) @ CAMERA.matrix.T
+        found = (there[:, :2] / there[:, 2:]).astype(np.float32), points
+        monkeypatch.setattr(Board, "_find_charuco", lambda *_, found=found: found)
+        assert (board.find(image) is not None) == (seen == 8)
 
 
 @pytest.fixture(scope="module")

@@ -34,46 +34,49 @@ def write(path, **changes):
     return path
 
 
-def test_written_calibration_is_read_back(tmp_path):
-    calibration = Calibration(640, 480, 525.06, 524.2, 308.6, 236.5, (0.1, -0.2, 1e-4, 2e-4, 0.3))
-    write_calibration(tmp_path / "calibration.json", calibration)
-    assert read_calibration(tmp_path / "calibration.json") == calibration
-    assert [file.name for file in tmp_path.iterdir()] == ["calibration.json"]
+PLAIN = Calibration(640, 480, 525.06, 524.2, 308.6, 236.5)
 
 
-def test_standard_deviations_are_written_and_read_back(tmp_path):
-    path = tmp_path / "calibration.json"
-    calibration = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, sigma=(1.5, 1.6, 0.7, 0.8))
-    write_calibration(path, calibration, sigma={"distortion": [0.1] * 5}, views=12)
-    assert read_calibration(path) == calibration
-    written = json.loads(path.read_text())
+@pytest.mark.parametrize(
+    "calibration",
+    [
+        PLAIN,
+        replace(PLAIN, distortion=(0.1, -0.2, 1e-4, 2e-4, 0.3), sigma=(1.5, 1.6, 0.7, 0.8)),
+        from_field_of_view(640, 480),
+    ],
+    ids=["plain", "with σ", "guessed"],
+)
+def test_a_calibration_is_read_back_and_what_was_not_stated_is_not_written(calibration, tmp_path):
+    write_calibration(tmp_path / "c.json", calibration)
+    assert read_calibration(tmp_path / "c.json") == calibration
+    assert [file.name for file in tmp_path.iterdir()] == ["c.json"]
+    assert calibration is not PLAIN or json.loads((tmp_path / "c.json").read_text()).keys() == {
+        "model", "width", "height", "fx", "fy", "cx", "cy", "distortion"
+    }  # fmt: skip
+
+
+def test_what_is_known_besides_is_written(tmp_path):
+    calibration = replace(PLAIN, sigma=(1.5, 1.6, 0.7, 0.8))
+    write_calibration(tmp_path / "c.json", calibration, sigma={"distortion": [0.1] * 5}, views=12)
+    assert read_calibration(tmp_path / "c.json") == calibration
+    written = json.loads((tmp_path / "c.json").read_text())
     assert written["sigma"] == {
         "fx": 1.5, "fy": 1.6, "cx": 0.7, "cy": 0.8, "distortion": [0.1] * 5
     }  # fmt: skip
     assert written["views"] == 12
 
 
-def test_what_nobody_stated_is_not_written(tmp_path):
-    write_calibration(tmp_path / "c.json", Calibration(640, 480, 525.0, 524.0, 308.5, 236.5))
-    assert json.loads((tmp_path / "c.json").read_text()).keys() == {
-        "model", "width", "height", "fx", "fy", "cx", "cy", "distortion"
-    }  # fmt: skip
-
-
-def test_a_guess_stays_a_guess_in_a_file(tmp_path):
-    write_calibration(tmp_path / "c.json", from_field_of_view(640, 480))
-    assert read_calibration(tmp_path / "c.json") == from_field_of_view(640, 480)
-
-
-@pytest.mark.parametrize("width", [640, 1000])
-def test_a_field_of_view_reaches_from_edge_to_edge(width):
-    calibration = from_field_of_view(width, 480, 80.0)
+def test_a_field_of_view_reaches_from_edge_to_edge():
+    calibration = from_field_of_view(640, 480, 80.0)
     assert calibration.guessed
-    across = np.degrees(np.arctan(width / 2 / calibration.fx)) * 2
+    across = np.degrees(np.arctan(320 / calibration.fx)) * 2
     assert across == pytest.approx(80.0, rel=1e-12)
     assert calibration.fx == calibration.fy
-    assert (calibration.cx, calibration.cy) == ((width - 1) / 2, 239.5)
+    assert (calibration.cx, calibration.cy) == (319.5, 239.5)
     assert calibration.sigma[:2] == (0.05 * calibration.fx,) * 2
+    for degrees in (0.0, 180.0, -60.0, float("nan")):
+        with pytest.raises(ValueError, match="between 0° and 180°"):
+            from_field_of_view(640, 480, degrees)
 
 
 def test_a_guess_is_of_the_longer_side_and_less_sure():
@@ -81,12 +84,6 @@ def test_a_guess_is_of_the_longer_side_and_less_sure():
     assert wide.fx == tall.fx == pytest.approx(320 / np.tan(np.radians(65 / 2)), rel=1e-12)
     assert wide.sigma[0] == pytest.approx(0.15 * wide.fx, rel=1e-12)
     assert wide.sigma[2] == pytest.approx(0.02 * 640, rel=1e-12)
-
-
-@pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan")])
-def test_a_field_of_view_that_no_pinhole_has_is_refused(degrees):
-    with pytest.raises(ValueError, match="between 0° and 180°"):
-        from_field_of_view(640, 480, degrees)
 
 
 def test_resized_keeps_directions_and_the_share_of_every_error():
@@ -107,7 +104,7 @@ def test_matrix_projects_as_a_pinhole(tmp_path):
     assert (u / w, v / w) == pytest.approx((525.0 * 0.2 + 308.5, 524.0 * -0.1 + 236.5))
 
 
-@pytest.mark.parametrize("given", [[], [0.1], [0.1, -0.2, 0.01, 0.02]])
+@pytest.mark.parametrize("given", [[], [0.1, -0.2, 0.01, 0.02]])
 def test_short_distortion_is_padded(tmp_path, given):
     calibration = read_calibration(write(tmp_path / "c.json", distortion=given))
     assert calibration.distortion == tuple(given) + (0.0,) * (5 - len(given))
@@ -121,15 +118,12 @@ def test_short_distortion_is_padded(tmp_path, given):
         ({"model": "fisheye", "distortion": [0.0] * 5}, "has 5 entries; expected at most k1, k2"),
         ({"fx": -525.0}, "fx must be positive, not -525.0"),
         ({"fy": float("nan")}, "fy must be finite, not nan"),
-        ({"cx": float("inf")}, "cx must be finite, not inf"),
         ({"width": 0}, "width must be positive, not 0"),
         ({"width": 640.5}, "width must be a whole number of pixels, not 640.5"),
         ({"fx": "525"}, "fx must be a number, not '525'"),
         ({"height": True}, "height must be a number, not True"),
-        ({"distortion": [0.0] * 6}, "has 6 entries"),
         ({"distortion": 0.1}, "distortion must be a list"),
         ({"distortion": [0.1, "x"]}, r"distortion\[1\] must be a number, not 'x'"),
-        ({"sigma": {"fx": 1.0}}, "an object with fx, fy, cx, cy"),
         ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "an object with fx, fy, cx, cy"),
         ({"sigma": SIGMAS | {"fx": -1.0}}, "sigma of fx must not be negative, not -1.0"),
         ({"sigma": SIGMAS | {"fx": "1"}}, "sigma of fx must be a number, not '1'"),
@@ -146,15 +140,11 @@ def test_bad_fields_are_refused_naming_file_and_field(tmp_path, changes, words):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [
-        ("{", "not a JSON file"),
-        ("[1]", "expected a JSON object, not a list"),
-        (None, "cannot read"),
-    ],
+    [("{", "not a JSON file"), ("[1]", "expected a JSON object, not a list"), ("", "cannot read")],
 )
 def test_other_files_are_refused(tmp_path, text, words):
     path = tmp_path / "c.json"
-    if text is not None:
+    if text:
         path.write_text(text)
     with pytest.raises(ValueError, match=words):
         read_calibration(path)

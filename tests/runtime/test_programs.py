@@ -96,16 +96,16 @@ def test_who_needs_it_waits_for_who_makes_it():
     assert len(traced) == 1
 
 
-def test_a_failure_is_told_to_everyone_and_tried_again():
+def test_a_failure_is_told_and_tried_again():
     def failing(x):
         traced.append(1)
         raise ValueError("no")
 
     program = Program(failing)
-    for _ in range(2):
+    for count in (1, 2):
         with pytest.raises(ValueError, match="no"):
             program(jnp.zeros(()))
-    assert len(traced) == 2
+        assert len(traced) == count
 
 
 def test_steps_are_taken_aside_in_the_callers_precision():
@@ -129,6 +129,9 @@ def test_a_kept_program_is_neither_traced_nor_compiled(folder):
     assert len(list(folder.iterdir())) == 1
     check(Program(scaled), 4)
     assert len(list(folder.iterdir())) == len(traced) == 2
+    (folder / "file").write_text("")
+    keep_in(folder / "file")
+    check(Program(scaled), 5)  # a folder that cannot be written is done without
 
 
 def test_shapes_of_a_kept_program_are_those_of_a_new_one(folder):
@@ -182,28 +185,6 @@ def test_every_file_of_the_package_is_among_its_sources():
     assert whole / "filters" / "slam.py" in programs.source_files()
 
 
-def test_a_function_with_values_of_its_own_is_not_kept(folder):
-    def around(value):
-        return lambda x: value * x
-
-    def called(function, x):
-        return function(x)
-
-    for value in (2.0, 3.0):
-        assert float(Program(called)(around(value), jnp.ones(()))) == value
-    assert not folder.exists()
-
-
-def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
-    (tmp_path / "file").write_text("")
-    keep_in(tmp_path / "file")
-    check(Program(scaled))
-
-
-def test_options_that_the_compiler_does_not_know_are_done_without():
-    check(Program(scaled, {"cpu": {"xla_no_such_option": True}}))
-
-
 def test_only_the_option_that_is_not_known_is_left_out(monkeypatch):
     asked, given = [], {"xla_new": 1, "xla_old": 2}
     compiled = jax.stages.Lowered.compile
@@ -252,11 +233,9 @@ class Choice:
 
 
 NAN = float("nan")
-UNEQUAL = ((2, 2.0), (True, 1), (1.0, True), (-0.0, 0.0))
+UNEQUAL = ((2, 2.0), (True, 1), (-0.0, 0.0))
 PLACES = (
     lambda x: (x,),
-    lambda x: (((x, "a"),),),
-    lambda x: (Choice(x),),
     lambda x: (partial(max, x),),
     lambda x: (Static(jnp.ones(2), x),),
     lambda x: (Static(jnp.ones(2), Choice((x,))),),
@@ -291,12 +270,6 @@ def written(module):
     return module.values * module.power
 
 
-def test_the_sign_of_a_zero_is_part_of_a_program():
-    program = Program(lambda m: jnp.arctan2(m.power, -m.values))
-    angles = [float(program(Static(jnp.ones(2), x))[0]) for x in (0.0, -0.0)]
-    np.testing.assert_allclose(angles, [np.pi, -np.pi])
-
-
 class Own(eqx.Module):
     """A piece of one's own."""
 
@@ -311,6 +284,8 @@ def test_what_may_change_without_notice_is_not_kept(folder, monkeypatch):
     monkeypatch.setattr(programs, "_known", KNOWN)
     check(Program(scaled))
     assert Program(operator.mul)(Own(jnp.ones(())), jnp.ones(())) == 1.0
+    for value in (2.0, 3.0):
+        assert Program(lambda function, x: function(x))(lambda x: value * x, jnp.ones(())) == value  # noqa: B023
     assert not folder.exists()
     assert Program(operator.mul)(jnp.ones(()), jnp.ones(())) == 1.0
     assert len(list(folder.iterdir())) == 1
@@ -327,18 +302,13 @@ def test_what_is_traced_is_seen_with_the_arguments_before_it_is_compiled():
     assert values.shape == (3,)
 
 
-def test_those_that_were_not_used_for_long_are_freed(monkeypatch):
+def test_those_that_were_not_used_for_long_are_freed_and_all_may_be_forgotten(monkeypatch):
     monkeypatch.setattr(programs, "MOST", 2)
     program = Program(scaled)
     for size in (3, 4, 3, 5, 3, 4):  # 4 was freed for 5
         check(program, size)
     assert len(traced) == 4
-
-
-def test_what_is_forgotten_is_made_again():
-    program = Program(lambda x: 2 * x)
-    program(jnp.ones(2))
     assert program._made
     forget()
     assert not program._made
-    assert program(jnp.ones(2)).tolist() == [2.0, 2.0]
+    check(program)

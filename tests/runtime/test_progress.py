@@ -24,20 +24,14 @@ def written(monkeypatch, file, patience=0.0):
     return file.getvalue()
 
 
-def test_a_terminal_has_a_bar_that_is_drawn_over(monkeypatch):
+def test_a_terminal_has_a_bar_and_a_log_has_lines_unless_it_is_short(monkeypatch):
     text = written(monkeypatch, Terminal())
     assert "\r" in text
     assert "20/20" in text
-
-
-def test_a_log_has_lines_without_control_characters(monkeypatch):
     lines = written(monkeypatch, io.StringIO()).splitlines()
     assert "waiting" in lines[0]
     assert "20/20" in lines[-1]
     assert all(line.isprintable() and len(line) <= 80 for line in lines)
-
-
-def test_what_is_short_leaves_no_line_in_a_log(monkeypatch):
     assert written(monkeypatch, io.StringIO(), patience=10.0) == ""
 
 
@@ -87,16 +81,6 @@ def test_no_time_is_left_to_tell_before_it_is_warm(monkeypatch):
     assert "4/10 [00:02<00:06" in warm
 
 
-def test_a_study_moves_a_bar_to_its_end(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    move = progress.StudyBar(4)
-    for name, done in (("a", 2), ("b", 1), ("b", 1)):  # as monte_carlo calls it
-        move(name, done)
-    assert "4/4" in terminal.getvalue()
-    assert terminal.getvalue().endswith("\n")  # closed
-
-
 def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
@@ -108,6 +92,7 @@ def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     last = terminal.getvalue().split("\r")[-1]
     assert last.startswith("a: 100%")
     assert "10/10" in last
+    assert last.endswith("\n")  # closed
 
 
 def test_the_time_left_of_a_study_is_that_of_its_runs(monkeypatch):
