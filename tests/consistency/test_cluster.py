@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-import jax
 import numpy as np
 import pytest
 from journeys import case, ends
 
 import jaxslam
 from jaxslam.consistency.cluster import on_cluster
-from jaxslam.consistency.montecarlo import ChunkTask, divided, in_threads
-from jaxslam.consistency.simulator import Simulator
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=4, landmarks=3)
@@ -146,16 +143,3 @@ def test_nobody_at_an_address_and_no_extra_are_said_in_one_line(monkeypatch):
     refused("no Dask scheduler answers at 'tcp://127.0.0.1:9'")
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(r"needs the cluster extra .* pip install '\.\[cluster\]'$")
-
-
-@pytest.mark.slow
-def test_what_computes_a_chunk_survives_a_pickle():
-    """In whatever precision the process is: this one's is float64."""
-    with jax.enable_x64(False):
-        (name, slam) = next(iter(filters().items()))
-        simulator = Simulator(SCENARIO, 5, "float32", 2)
-        task = ChunkTask(name, slam, simulator, simulator.room(divided(4, 2), in_threads))
-        whole = cloudpickle.dumps(task)
-        again = cloudpickle.loads(whole)
-    assert len(whole) < 20_000
-    assert_same([again(range(2, 4))], [task(range(2, 4))])

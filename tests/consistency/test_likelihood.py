@@ -53,17 +53,6 @@ def test_gradients_through_a_run_are_those_of_central_differences(case, name):
 
 
 @pytest.mark.slow
-def test_every_number_of_a_filter_has_a_derivative(case):
-    slam = jaxslam.cast(case.filter("robocentric", calibration="white"), jnp.float64)
-    found = eqx.filter_jit(eqx.filter_grad(log_likelihood))(slam, case.room, case.run(0))
-    leaves = jax.tree.leaves(found)
-    assert len(leaves) == len(jax.tree.leaves(slam))
-    assert all(np.isfinite(x).all() for x in leaves)
-    for number in (found.motion.velocity_sigma, found.calibration.sigma, found.depth.mean):
-        assert np.abs(number).max() > 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "scenario", "options"),
     [

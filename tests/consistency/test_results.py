@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +10,7 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.consistency import FolderStore, MemoryStore, Results, Seconds, Study, montecarlo
-from jaxslam.consistency.montecarlo import Interruption
+from jaxslam.consistency import MemoryStore, Results, Seconds, Study, montecarlo
 from jaxslam.plots.consistency import plot_beyond_scale, plot_consistency, plot_nees
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Verdict, sentences
@@ -175,15 +173,9 @@ def test_a_notebook_shows_html_and_tables_are_made_where_their_libraries_are(mon
 
 @pytest.mark.parametrize(
     ("runs", "number", "seconds", "chunk"),
-    [
-        (1000, 2, 0.01, 100),
-        (100, 2, 0.01, 12),
-        (100, 1, 0.01, 25),
-        (5, 2, 9.0, 100),
-        (1000, 2, 0.3, 50),
-        (1000, 2, 10.0, 12),
-    ],
-)
+    [(1000, 2, 0.01, 100), (100, 2, 0.01, 12), (100, 1, 0.01, 25), (5, 2, 9, 100),
+     (1000, 2, 0.3, 50), (1000, 2, 10, 12)],
+)  # fmt: skip
 def test_chunks_keep_every_processor_busy_and_a_bar_moving(
     runs, number, seconds, chunk, monkeypatch
 ):
@@ -216,16 +208,6 @@ def test_filters_are_made_of_words_and_what_they_cannot_be_is_said():
         jaxslam.monte_carlo(WORLD, {"mine": "robocentric"})
 
 
-def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    store = FolderStore(Path("here"))
-    assert str(Interruption(20, 60, 10, store)).startswith("20 of 60 runs are kept in here; the sa")
-    told = str(Interruption(0, 60, 10, store))
-    assert told.startswith("no chunk of 10 runs was finished, so that nothing of 60 is kept in her")
-    assert told.endswith("with a chunk smaller than 10 the first runs are kept sooner")
-    assert "20 of 60 runs were finished, and are not kept" in str(Interruption(20, 60, 10, None))
-
-
 def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():
     for dof, runs in ((300, 3), (101, 100)):
         with pytest.raises(ValueError, match=f"{dof} degrees of freedom and {runs} runs: mean_b"):
@@ -233,6 +215,3 @@ def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():
     for dof, runs in ((100, 3), (101, 101)):  # a pose's, and of as many runs as a state has
         low, high = jaxslam.mean_band(dof, runs)
         assert low < dof < high
-    nees = np.random.default_rng(0).chisquare(300, (3, 2))
-    low, high = jaxslam.evaluation.evaluate_nees(nees, 300).band95
-    assert 200 < low < 300 < high < 400

@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
+from cases import FourFunctions
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore, manifest, simulator
@@ -258,31 +259,13 @@ def test_code_that_cannot_be_seen_is_named(tmp_path, monkeypatch):
     assert not manifest.unseen(described(SLAM))
 
     with pytest.warns(UserWarning, match=r"not seen: abs\(…\), getattr\(…\) in f; .* resumed"):
-        begin(FolderStore(tmp_path), monkeypatch, slam=own_filter(function))
-
-
-def own_filter(function):
-    class Mine(jaxslam.AbstractFilter):
-        base: jaxslam.AbstractFilter
-
-        def init(self, capacity, first=None, known=None):
-            return self.base.init(capacity, first, known)
-
-        def step(self, state, control, seen, new):
-            return function(self.base.step(state, control, seen, new))
-
-        def marginal(self, state, function):
-            return self.base.marginal(state, function)
-
-        def landmark_marginal(self, state, function, slots):
-            return self.base.landmark_marginal(state, function, slots)
-
-    return Mine(SLAM)
+        begin(FolderStore(tmp_path), monkeypatch, slam=FourFunctions(SLAM, function))
 
 
 def test_a_mended_helper_does_not_resume_the_old_numbers(tmp_path, monkeypatch):
     def mine(sign):
-        return own_filter(of_source(f"def helper(x): return {sign}x\ndef f(x): return helper(x)"))
+        source = f"def helper(x): return {sign}x\ndef f(x): return helper(x)"
+        return FourFunctions(SLAM, of_source(source))
 
     begin(FolderStore(tmp_path), monkeypatch, slam=mine(""))
     study(FolderStore(tmp_path, resume=True), slam=mine(""))

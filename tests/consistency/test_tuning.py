@@ -11,7 +11,7 @@ import pytest
 
 import jaxslam
 from jaxslam.consistency import draw, fit_of, log_likelihood, of_simulation
-from jaxslam.consistency.tuning import NOISE, _Search
+from jaxslam.consistency.tuning import NOISE, TuningSettings, _Search
 
 MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
 SENSOR = jaxslam.RangeBearing([0.1, 0.02])
@@ -81,7 +81,7 @@ def test_a_bias_that_no_noise_explains_is_a_wrong_model(tuned, logs):
 def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
     start = slam(jaxslam.Odometry([0.02, 0.0, 0.01]))
     bounds, priors = {"sensor.sigma": (0.01, 0.5)}, {"motion.noise_sigma": (0.02, 2)}
-    search = _Search.of(start, NOISE, bounds, priors, jaxslam.TuningSettings())
+    search = _Search.of(start, NOISE, bounds, priors, TuningSettings())
     np.testing.assert_allclose(search.values(search.first)["motion.noise_sigma"], [0.02, 0, 0.01])
     np.testing.assert_allclose(search.values(search.first)["sensor.sigma"], [0.1, 0.02])
     far = search.values(search.first + np.array([0, 9, 0, 99, -99]))

@@ -157,6 +157,7 @@ def with_truth_sigma(*sigma):
 
 ONE, UPPER, DEVIATIONS = np.ones((1, 1, 1)), "1 " * 22, "0 1 1 -0.1 1 1 1"
 NEES = "run,step,nees,dof\n0,0,1,3\n"
+POSES = {"estimates": T, "covariances": POSE_P, "truths": TRUTH}
 OF_FILES = [
     (csv("0,0,1,1\n0,1,1\n"), "line 2: expected numbers run, step, n errors"),
     (csv("0,0,1,1,3\n"), "5 columns; expected numbers run, step.*4 for n = 1, 7 for 2, 11 for 3"),
@@ -173,6 +174,7 @@ OF_FILES = [
     (npz({"errors": ONE, "covariances": np.array("many")}), "must be numbers"),
     (npz({"errors": 1, "innovations": 1, "covariances": 1}), "contains errors, innovations"),
     (npz({"estimates": np.ones((1, 1, 4, 4)), "covariances": 1.0}), "covariances and truths"),
+    (npz(POSES | {"error": []}), "unknown error ''; known: right, left, split"),
     (npz({"errors": ONE, "sigmas": -1.22 * ONE}), r"sigmas of run 0, step 0 must not .* -1\.22"),
     (of_errors(stated={"error": "left"}), "axes used and σ of the truth apply to poses"),
     (of_errors(axes_used="x"), "axes used and σ of the truth apply to poses"),

@@ -2,8 +2,8 @@
 
 import dataclasses
 import operator
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -68,30 +68,15 @@ def test_a_program_is_made_once_for_each_structure():
     assert len(traced) == 3
 
 
-def test_it_is_made_from_shapes_before_there_are_numbers():
-    program = Program(scaled)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments())
-    after = program.compile(*shapes)
-    assert (after["values"].shape, after["values"].dtype) == ((3,), arguments()[1].dtype)
-    assert isinstance(after["depth"], InverseDepth)
-    check(program)
-    assert len(traced) == 1
-
-
 def test_who_needs_it_waits_for_who_makes_it():
     def slow(x):
         traced.append(1)
         time.sleep(0.3)
         return x + 1
 
-    program, found = Program(slow), []
-    threads = [
-        threading.Thread(target=lambda: found.append(program(1 + jnp.zeros(())))) for _ in "ab"
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    program = Program(slow)
+    with ThreadPoolExecutor() as threads:
+        found = list(threads.map(program, [1 + jnp.zeros(())] * 2))
     assert found == [2.0, 2.0]
     assert len(traced) == 1
 
@@ -136,8 +121,12 @@ def test_a_kept_program_is_neither_traced_nor_compiled(folder):
 
 def test_shapes_of_a_kept_program_are_those_of_a_new_one(folder):
     """What is called with another's result is found again, whoever made that."""
-    new = Program(scaled).compile(*arguments())
-    kept = Program(scaled).compile(*arguments())
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments())
+    new, kept = (Program(scaled).compile(*shapes) for _ in "ab")
+    assert len(traced) == 1
+    assert (new["values"].shape, new["values"].dtype) == ((3,), arguments()[1].dtype)
+    assert isinstance(new["depth"], InverseDepth)
+    check(Program(scaled))
     assert len(traced) == 1
     keys = [programs._Call.of((x,)).key for x in (new, kept)]
     assert keys[0] == keys[1]
@@ -289,17 +278,6 @@ def test_what_may_change_without_notice_is_not_kept(folder, monkeypatch):
     assert not folder.exists()
     assert Program(operator.mul)(jnp.ones(()), jnp.ones(())) == 1.0
     assert len(list(folder.iterdir())) == 1
-
-
-def test_what_is_traced_is_seen_with_the_arguments_before_it_is_compiled():
-    told = []
-    program = Program(scaled, seen=lambda jaxpr, args: told.append((len(jaxpr.eqns) > 0, args)))
-    check(program)
-    check(program)
-    ((has_equations, (depth, values)),) = told
-    assert has_equations
-    assert isinstance(depth, InverseDepth)
-    assert values.shape == (3,)
 
 
 def test_those_that_were_not_used_for_long_are_freed_and_all_may_be_forgotten(monkeypatch):

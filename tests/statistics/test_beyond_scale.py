@@ -72,7 +72,7 @@ def test_it_is_chi_square_with_one_degree_of_freedom_fewer(geometry):
     assert 0.99 * low < np.sum((found.log_scale / found.sigma) ** 2) < 1.01 * high
 
 
-@pytest.mark.parametrize("factor", [0.05, 1.3, 30.0])
+@pytest.mark.parametrize("factor", [0.05, 30.0])
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_pure_error_of_scale_is_nothing_beyond_it(geometry, factor):
     truth, P = pose(geometry, 3), covariance(geometry.tangent_dim)
@@ -81,21 +81,6 @@ def test_a_pure_error_of_scale_is_nothing_beyond_it(geometry, factor):
         found = beyond_scale(lambda T, own=own: (difference(own(T), own(estimate)), P), truth)
         assert found.nees < 1e-18
         np.testing.assert_allclose(found.log_scale, np.log(factor), rtol=1e-8, atol=1e-12)
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_it_does_not_depend_on_what_is_claimed_of_the_scale(geometry):
-    truth, g, error = linear_case(geometry)
-    P, noise = covariance(geometry.tangent_dim), 0.02 * jnp.ones(geometry.tangent_dim)
-    first, other = (
-        beyond_scale(lambda T, c=c: (error(T, noise), P + c * jnp.outer(g, g)), truth)
-        for c in (0.0, 9.0)
-    )
-    np.testing.assert_allclose(first.nees, other.nees, rtol=1e-8)
-    np.testing.assert_allclose(first.log_scale, other.log_scale, rtol=1e-8)
-    # σ² of log s is that of s, which grows by c, over s².
-    s = np.exp(first.log_scale)
-    np.testing.assert_allclose(other.sigma**2 - first.sigma**2, 9.0 / s**2, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
-"""Tests of the verdict on one study: its rate of false alarms, its coverage, what it says."""
+"""Tests of the verdict on one study; `benchmarks/verdicts.py` counts how often it is wrong."""
 
 import json
 
 import numpy as np
 import pytest
+import verdicts as benchmark
 from scipy import stats
 
 from jaxslam.statistics import Tally, lost_threshold, not_disproved, run_verdict
@@ -24,13 +25,7 @@ def shortfalls(dof, level):
 
 def series(rng, runs, steps=20, dof=3, correlation=0.95):
     """NEES of a consistent filter, (runs, steps): χ² at every step, whatever the correlation."""
-    error = rng.normal(size=(runs, dof))
-    nees = np.empty((runs, steps))
-    for step in range(steps):
-        nees[:, step] = np.sum(error**2, axis=1)
-        new = rng.normal(size=error.shape)
-        error = correlation * error + np.sqrt(1 - correlation**2) * new
-    return nees
+    return benchmark.series(rng, runs, dof, steps, correlation)
 
 
 def studies(count, runs, seed=0, **of):
@@ -51,24 +46,13 @@ def words(many, dof=3):
     return [Tally.of(nees, dof).decisive().word for nees in many]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("dof", "runs"), [(1, 3), (6, 10), (3, 100)])
-@pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.98)])
-def test_a_right_filter_is_called_inconsistent_in_less_than_one_of_a_hundred_studies(
-    dof, runs, steps, correlation
-):
-    """Of 400 studies 4 expected at most; 13 or more have a chance of 1 in 3000."""
-    many = studies(400, runs, dof=dof, steps=steps, correlation=correlation)
-    assert sum(word.endswith("confident") for word in words(many, dof)) < 13
-
-
 @pytest.mark.parametrize("runs", [1, 10, 200])
 @pytest.mark.parametrize("factor", [1.3, 1 / 1.3])
 def test_a_sigma_wrong_by_30_percent_is_not_called_consistent(runs, factor):
-    """Of 200 studies 2 are allowed, and 9 or more have a chance of 1 in 4000."""
+    """Of 100 studies one is allowed, and 7 or more have a chance of 1 in 10 000."""
     for correlation in (0.0, 0.98):
-        many = factor**2 * studies(200, runs, steps=6, correlation=correlation)
-        assert words(many).count("consistent") < 9
+        many = factor**2 * studies(100, runs, steps=6, correlation=correlation)
+        assert words(many).count("consistent") < 7
 
 
 def test_of_next_to_no_degrees_of_freedom_runs_are_counted_too():
@@ -91,19 +75,11 @@ def test_with_runs_enough_a_right_filter_is_consistent_and_with_fewer_nobody_can
 def test_a_sigma_wrong_by_5_percent_is_found_with_2000_runs():
     """In 95 of 100 studies, or more, though the steps of a run are all but one."""
     for word, factor in {"over-confident": 1.05, "under-confident": 1 / 1.05}.items():
-        found = [run_verdict(factor**2 * nees, 3) for nees in studies(40, 2000, steps=10)]
+        found = [run_verdict(factor**2 * nees, 3) for nees in studies(30, 2000, steps=10)]
         assert np.mean([verdict["word"] == word for verdict in found]) > 0.9
         low, high = np.array([verdict["interval99"] for verdict in found]).T
         assert np.mean((low < factor) & (factor < high)) > 0.93
         assert np.mean(high - low) < 0.08
-
-
-def test_the_interval_holds_a_mean_that_one_run_in_a_hundred_makes():
-    """Of twenty times the variance: in a third of the studies of 100 runs there is none."""
-    many = studies(400, 100, steps=1)
-    many[np.random.default_rng(1).random((400, 100)) < 0.01] *= 20
-    low, high = np.array([Tally.of(nees, 3).looks()[0].interval for nees in many]).T
-    assert np.mean((low <= 1.19) & (high >= 1.19)) > 0.97
 
 
 def test_the_limit_of_skewed_numbers_is_where_their_p_value_is_the_level():
@@ -117,7 +93,7 @@ def test_the_limit_of_skewed_numbers_is_where_their_p_value_is_the_level():
 
 @pytest.mark.parametrize("runs", [1, 3, 200])
 def test_word_interval_and_p_value_say_the_same(runs):
-    for scale in np.geomspace(0.2, 6, 40):
+    for scale in np.geomspace(0.2, 6, 20):
         nees = scale * studies(1, runs, steps=6, seed=runs)[0]
         found = run_verdict(nees, 3)
         for each in (found, found["mean"], found["end"], *found["thirds"]):
@@ -167,15 +143,6 @@ def test_faults_that_cancel_in_the_mean_are_found_in_the_parts():
     where = {"last step": "at the last step"}.get(found["of"], f"in the {found['of']}")
     assert sentences(found)[0].startswith(f"{where} NEES {found['nees']:.2f}, σ too ")
     assert sentences(found)[1].startswith("over all steps: NEES ")
-
-
-def test_the_end_alone_decides_where_only_it_is_wrong():
-    nees = studies(1, 100, steps=60, correlation=0.0)[0]
-    nees[:, -1] *= 3
-    found = run_verdict(nees, 3)
-    assert (found["word"], found["of"]) == ("over-confident", "last step")
-    assert found["nees"] == pytest.approx(nees[:, -1].mean())
-    assert found["interval99"] == found["end"]["interval99"]
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
@@ -260,17 +227,11 @@ def test_with_a_diverged_run_there_is_no_mean(value):
     assert (verdict["word"], verdict["nees"], verdict["sigma_factor"]) == ("lost", None, None)
     assert (verdict["p"], verdict["end"]["p"], verdict["diverged"]) == (0.0, 0.0, 1)
     assert verdict["never_lost"]["word"] == "consistent"
-    json.dumps(verdict, allow_nan=False)
     assert sentences(verdict)[0] == "1 of 1000 runs diverged, no mean NEES: lost"
-
-
-@pytest.mark.parametrize("value", [np.nan, 1e200])
-def test_a_study_of_lost_runs_only_has_a_verdict(value):
-    verdict = run_verdict(np.full((4, 3), value), 3)
-    json.dumps(verdict, allow_nan=False)
-    assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
-    assert verdict["never_lost"]["runs"] == 0
-    assert sentences(verdict)[-1] == "all 4 runs were lost"
+    none_left = run_verdict(np.full((4, 3), value), 3)
+    json.dumps([verdict, none_left], allow_nan=False)
+    assert none_left["never_lost"]["runs"] == 0
+    assert sentences(none_left)[-1] == "all 4 runs were lost"
 
 
 # --- degrees of freedom that a fit may have taken -------------------------------------------------
@@ -325,14 +286,6 @@ def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole(fitted):
     assert together["never_lost"]["interval99"] == pytest.approx(whole["never_lost"]["interval99"])
 
 
-def test_power_sums_have_the_moments_of_their_numbers():
-    values = np.random.default_rng(9).gamma(2.0, size=50)
-    sums = PowerSums.of(values)
-    assert sums.mean == pytest.approx(values.mean())
-    assert sums.deviation == pytest.approx(values.std(ddof=1))
-    assert sums.skewness == pytest.approx(stats.skew(values))
-
-
 def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
     verdict = run_verdict(np.full((1, 4), 100.0), 3)
     low, high = verdict["interval99"]
@@ -347,20 +300,17 @@ def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
     ("factor", "text"),
     [
         (1.0, "σ right up to a factor 1.00 [0.96, 1.05]: consistent"),
-        (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident"),
-        (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident"),
+        (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident (p < 0.0001)"),
+        (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident (p < 0.0001)"),
     ],
 )
 def test_a_verdict_is_said_in_words(factor, text):
     nees = consistent()
-    nees *= 3 * factor**2 / nees.mean()
-    nees = np.minimum(nees, lost_threshold(3))
+    nees = np.minimum(nees * 3 * factor**2 / nees.mean(), lost_threshold(3))
     found = run_verdict(nees, 3)
     said, at_the_end = sentences(found)[:2]
-    p = f"p = {found['p']:.2g}" if factor == 1 else "p < 0.0001"
-    assert said == f"NEES {found['nees']:.2f}, {text} ({p})"
+    assert said.startswith(f"NEES {found['nees']:.2f}, {text}")
     assert at_the_end.startswith(f"at the last step: NEES {nees[:, -1].mean():.2f}, σ ")
-    assert found["end"]["word"] == found["word"]
 
 
 TALLY = Tally.of(np.ones((5, 4)), 3)
