@@ -57,6 +57,7 @@ OF_ARRAYS = [
     (arrays(times=[1, 2, 3]), "times must be 7 finite, non-decreasing"),
     (arrays(times=[0, 1, 2, 3, 2, 5, 6]), "times must be 7 finite, non-decreasing"),
     (arrays(times=np.full(7, np.nan)), "times must be 7 finite, non-decreasing"),
+    (arrays(times="soon"), "times must be 7 finite, non-decreasing"),
     (arrays(names=["x", "x", "y"]), "names must be 3 different ones"),
     (arrays(quantity="NES"), r"unknown quantity 'NES' .*known: NEES, NIS"),
     (arrays(SET_OUT, KNOWN), r"run 3, step 0 is zero.* is not: 0\.2.*--align"),
@@ -261,6 +262,10 @@ OF_FOLDERS = [
     (another("estimate.txt"), r"has a run and sub-folders with runs \(run00, run01\)"),
     (without("run01/truth.txt"), r"run01 has no truth\.txt"),
     (without("run00/estimate.txt"), r"run00 has no estimate\.txt"),
+    (
+        two_runs(lambda x: write_tum(x / "run01/truth.txt", [99.0], np.eye(4)[None])),
+        r"no time stamps in common within 0\.01 s",
+    ),
     (stated(np.eye(6), Convention("left")), "states a different convention"),
     (stated(-np.eye(6), Convention()), ": the covariance of run01, step 0 has variance -1"),
     (

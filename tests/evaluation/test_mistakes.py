@@ -10,7 +10,7 @@ from logs import write_runs
 from scipy.spatial.transform import Rotation
 
 import jaxslam
-from jaxslam.evaluation import Convention
+from jaxslam.evaluation import Convention, sanity_checks
 
 NAMES = ("x", "y", "heading")
 SIGMA, DEGREES = benchmark.AXIS_SIGMA, benchmark.UNITS
@@ -144,3 +144,12 @@ def test_a_bias_that_all_runs_share_or_an_order_by_scatter_does_not_make_them_st
         shared = correlated(1, 40, 3, 0.99, seed=1000 + seed)
         assert said(e + 3 * SIGMA * shared, P) == ""
         assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
+
+
+def test_an_order_is_told_whatever_the_unit_of_what_is_ordered():
+    for unit in (1e-4, 1e4):
+        walk = unit * np.cumsum(np.random.default_rng(0).normal(size=(12, 5)), axis=0)
+        products = sanity_checks._products(walk - walk.mean(axis=0))
+        shuffled = np.random.default_rng(1).permutation(12)
+        assert sanity_checks._by_order(products)
+        assert not sanity_checks._by_order(products[np.ix_(shuffled, shuffled)])
