@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Generator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -149,7 +150,7 @@ def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     """One run diverges, others are lost: all that is counted has something to count. No quick test
     adds up sums of chunks in place of their records."""
     spoilt = jaxslam.scenario("matched-loose", steps=6)
-    name, six = "robocentric/cartesian", {"runs": 40, "chunk": 6}
+    name, six = "robocentric/cartesian", dict[str, Any](runs=40, chunk=6)
     whole = jaxslam.monte_carlo(spoilt, name, **six)
     store = FolderStore(tmp_path, {"reduced": True}, resume=False)
     reduced = jaxslam.monte_carlo(spoilt, name, **six, store=store, reduced=True)

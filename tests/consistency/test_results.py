@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.consistency import MemoryStore, Results, Seconds, Study, montecarlo
-from jaxslam.plots.consistency import plot_beyond_scale, plot_consistency, plot_nees
+from jaxslam.consistency import FolderStore, MemoryStore, Results, Seconds, Study, montecarlo
+from jaxslam.consistency.montecarlo import Interruption
+from jaxslam.plots.consistency import plot_beyond_scale, plot_nees
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Verdict, sentences
 
@@ -134,7 +135,7 @@ def test_a_filter_that_always_diverges_spoils_neither_table_nor_figure(tmp_path)
         assert axes.get_ylim()[1] < 2 * others.get_ylim()[1]
         band, wanted = (x.patches[0].get_extents() for x in (axes, others))
         assert (band.y0, band.y1) == pytest.approx((wanted.y0, wanted.y1), rel=0.2)
-    assert plot_consistency(study((math.nan, math.nan)), path=tmp_path / "figure.png").axes
+    assert study((math.nan, math.nan)).plot(tmp_path / "figure.png", column=True).axes
 
 
 def test_an_interval_next_to_one_excludes_it_in_words():
@@ -206,6 +207,14 @@ def test_filters_are_made_of_words_and_what_they_cannot_be_is_said():
             jaxslam.monte_carlo(WORLD, wrong)
     with pytest.raises(ValueError, match="mine is no AbstractFilter but str"):
         jaxslam.monte_carlo(WORLD, {"mine": "robocentric"})
+
+
+def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path):
+    """What is kept in a folder is a test of the studies that are interrupted."""
+    told = str(Interruption(0, 60, 10, FolderStore(tmp_path)))
+    assert told.startswith("no chunk of 10 runs was finished, so that nothing of 60 is kept in /")
+    assert told.endswith("with a chunk smaller than 10 the first runs are kept sooner")
+    assert "20 of 60 runs were finished, and are not kept" in str(Interruption(20, 60, 10, None))
 
 
 def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():

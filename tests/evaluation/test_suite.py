@@ -268,6 +268,9 @@ def test_a_scenario_that_no_suite_has_is_refused(changes, message, tmp_path):
     """Landmarks need a number of their own, and measurements are pixels."""
     with pytest.raises(ValueError, match=f"^small:? .*{message}"):
         write_suite(tmp_path / "suite", [jaxslam.scenario(SMALL, **changes)], runs=1)
+    with pytest.raises(ValueError, match="a suite needs at least one scenario; by default it has"):
+        write_suite(tmp_path / "suite", [], runs=1)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("told", [[1], {"scenario": {}, "runs": 3}])

@@ -167,10 +167,10 @@ def test_a_reader_faster_than_the_camera_waits_for_the_next_picture(monkeypatch,
 
 def test_a_camera_without_a_picture_or_with_a_start_is_refused(monkeypatch, calibration):
     monkeypatch.setattr(camera, "PATIENCE", 0.2)
-    for count, options, message in (
-        (0, {}, "camera 7 delivers no pictures"),
-        (None, {"start": 1.0}, "a live camera starts when it is opened"),
+    for count, start, message in (
+        (0, 0.0, "camera 7 delivers no pictures"),
+        (None, 1.0, "a live camera starts when it is opened"),
     ):
         monkeypatch.setattr(cv2, "VideoCapture", lambda n, count=count: Filming(count))
         with pytest.raises(ValueError, match=message):
-            open_source("7", calibration=calibration, **options)
+            open_source("7", calibration=calibration, start=start)
