@@ -171,6 +171,7 @@ OF_FILES = [
     (csv(NEES + "0,1,1,4.5\n"), "dof must be one whole number from 1"),
     (csv(NEES + "0,1,1,nan\n"), "line 3: expected numbers run, step"),
     (npz({"errors": ONE}), "errors and covariances"),
+    (npz({"errors": np.array([None])}), "not an npz file of numbers"),
     (npz({"eror": ONE}), r"unknown array 'eror' \(did you mean error\?\)"),
     (npz({"errors": ONE, "covariances": np.array("many")}), "must be numbers"),
     (npz({"errors": 1, "innovations": 1, "covariances": 1}), "contains errors, innovations"),

@@ -93,6 +93,10 @@ def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     assert last.startswith("a: 100%")
     assert "10/10" in last
     assert last.endswith("\n")  # closed
+    move = progress.StudyBar(4)
+    for name, runs in (("a", 2), ("b", 2)):  # on a cluster
+        move(name, runs)
+    assert "b: 100%" in terminal.getvalue()
 
 
 def test_the_time_left_of_a_study_is_that_of_its_runs(monkeypatch):

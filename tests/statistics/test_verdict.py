@@ -16,7 +16,7 @@ from jaxslam.statistics.bands import (
     skewed_limit,
 )
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
-from jaxslam.statistics.verdict import sentences
+from jaxslam.statistics.verdict import brief, sentences
 
 
 def shortfalls(dof, level):
@@ -310,6 +310,7 @@ def test_a_verdict_is_said_in_words(factor, text):
     found = run_verdict(nees, 3)
     said, at_the_end = sentences(found)[:2]
     assert said.startswith(f"NEES {found['nees']:.2f}, {text}")
+    assert brief(found).startswith(f"{found['word']}, σ × {found['sigma_factor']:.2f} [")
     assert at_the_end.startswith(f"at the last step: NEES {nees[:, -1].mean():.2f}, σ ")
 
 
