@@ -83,6 +83,10 @@ def test_consistency_writes_what_others_read_and_resumes(tmp_path, capsys):
         (["consistency", "--calibration", "maybe"], "unknown calibration 'maybe'"),
         (["consistency", "--set", "pixel_sigma=nan"], "pixel_sigma holds nan"),
         (["consistency", "--set", "pixel_sigma"], "not of the form field=value"),
+        (
+            ["evaluate", "--suite", "mine", "--scenario"],
+            "a suite needs at least one scenario; by d",
+        ),
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
