@@ -387,7 +387,7 @@ MISTAKES = {
     "angle not wrapped": "wrapped",
     "errors in degrees": "degrees",
     "covariances in degrees": "degrees",
-    "steps before runs": "interchanged",
+    "steps before runs": "swapped",
     "heading lost": "",
 }
 """A word that names the mistake; none where there is none."""

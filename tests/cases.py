@@ -7,6 +7,7 @@ alone where zero is expected.
 """
 
 import itertools
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
@@ -223,6 +224,26 @@ def keys_used(monkeypatch, function):
         value = jax.block_until_ready(function())
         jax.effects_barrier()
     return value, found
+
+
+class FourFunctions(AbstractFilter):
+    """A filter of no more functions than a study needs, which asks another; with something that is
+    done to the result of a step."""
+
+    estimator: AbstractFilter
+    done: Callable[[Any], Any] = lambda result: result
+
+    def init(self, capacity, first=None, known=None):
+        return self.estimator.init(capacity, first, known)
+
+    def step(self, state, control, seen, new):
+        return self.done(self.estimator.step(state, control, seen, new))
+
+    def marginal(self, state, function):
+        return self.estimator.marginal(state, function)
+
+    def landmark_marginal(self, state, function, slots):
+        return self.estimator.landmark_marginal(state, function, slots)
 
 
 class Around(AbstractStaged):

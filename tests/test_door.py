@@ -37,17 +37,19 @@ def test_a_step_with_the_wrong_control_says_what_is_asked_for():
 
 
 @pytest.mark.parametrize(
-    "wrong", [lambda: features(2, p=2), lambda: replace(features(2), slots=jnp.arange(3))]
+    ("given", "message"),
+    [
+        (lambda: (2, features(2, p=2)), "features.measured has shape"),
+        (
+            lambda: (2, replace(features(2), slots=jnp.arange(3))),
+            "features.(slots|measured) has shape",
+        ),
+        *[(lambda x=x: (x,), "capacity is of so many landmarks") for x in (0, -1, 2.5, "many")],
+    ],
 )
-def test_features_of_another_shape_are_refused_by_name(wrong):
-    with pytest.raises(ValueError, match=r"features\.(slots|measured) has shape"):
-        a_filter().init(2, wrong())
-
-
-@pytest.mark.parametrize("wrong", [0, -1, 2.5, "many"])
-def test_a_capacity_is_a_whole_number(wrong):
-    with pytest.raises(ValueError, match="capacity is of so many landmarks"):
-        a_filter().init(wrong)
+def test_features_and_capacities_of_another_kind_are_refused_by_name(given, message):
+    with pytest.raises(ValueError, match=message):
+        a_filter().init(*given())
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def _evaluate_arrays(
         return evaluate_nees(arrays[held[0]], arrays["dof"], times=times, quantity=quantity)
     P = arrays["covariances"]
     if held == ["estimates"]:
-        said = {name: str(np.ravel(arrays[name])[0]) for name in CHOICES if name in arrays}
+        said = {name: str(*np.ravel(arrays[name])[:1]) for name in CHOICES if name in arrays}
         convention = stated_before(said, stated)
         truths = arrays["truths"]
         return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)

@@ -37,8 +37,10 @@ VERDICT_KEYS = {
 
 
 @pytest.mark.slow
-def test_consistency_writes_what_others_read(tmp_path, capsys):
-    main([*SMALL, "--chunk", "3", "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
+def test_consistency_writes_what_others_read_and_resumes(tmp_path, capsys):
+    """No quick test sends a whole study through the command."""
+    whole = [*SMALL, "--chunk", "3", "--out", str(tmp_path), "--set", "pixel_sigma=0.4"]
+    main(whole)
     summary = json.loads((tmp_path / "consistency.json").read_text())
     assert summary["schema"] == 1
     assert (summary["runs"], summary["steps"], summary["seed"]) == (6, 6, 0)
@@ -55,31 +57,19 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     assert "at one scale a run" in printed
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"consistency.json", "consistency.png", "runs"}
-
-
-@pytest.mark.slow
-def test_consistency_resumes_to_more_runs(tmp_path, capsys):
-    few = [*SMALL, "--chunk", "2", "--landmarks", "inverse_scaling", "--set", "landmarks=5"]
-    chunked = [*few, "--out", str(tmp_path)]
-    main(chunked)
-    first = json.loads((tmp_path / "consistency.json").read_text())
-    main([*chunked, "--resume"])
-    again = json.loads((tmp_path / "consistency.json").read_text())
-    name = "robocentric/inverse_scaling"
-    assert again["filters"][name]["nees"] == first["filters"][name]["nees"]
-    assert again["filters"][name]["seconds"]["run"] == 0
-    with pytest.raises(SystemExit) as stop:
-        main([*chunked, "--resume", "--seed", "1"])
-    assert stop.value.code == 2
-    assert "another seed" in capsys.readouterr().err
-    in_sums = ["--out", str(tmp_path / "sums")]
-    main([*few, *in_sums, "--reduce"])
-    sums = json.loads((tmp_path / "sums" / "consistency.json").read_text())
-    assert sums["filters"][name]["nees"] == first["filters"][name]["nees"]
-    assert (sums["medians_of"], first["medians_of"]) == (2, 6)
-    with pytest.raises(SystemExit):
-        main([*few, *in_sums, "--resume"])
-    assert "another reduced (True, now False)" in capsys.readouterr().err
+    main([*whole, "--resume"])
+    again = json.loads((tmp_path / "consistency.json").read_text())["filters"]
+    for name, result in again.items():
+        assert result["nees"] == summary["filters"][name]["nees"]
+        assert result["seconds"]["run"] == 0
+    for more, message in (
+        (["--seed", "1"], "another seed"),
+        (["--reduce"], "another reduced (False, now True)"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main([*whole, "--resume", *more])
+        assert stop.value.code == 2
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -93,16 +83,15 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["consistency", "--calibration", "maybe"], "unknown calibration 'maybe'"),
         (["consistency", "--set", "pixel_sigma=nan"], "pixel_sigma holds nan"),
         (["consistency", "--set", "pixel_sigma"], "not of the form field=value"),
-        (["consistency", "--dtype", "int8"], "unknown dtype 'int8'"),
+        (
+            ["evaluate", "--suite", "mine", "--scenario"],
+            "a suite needs at least one scenario; by d",
+        ),
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
         (["track", "--fov", "60"], "need a SOURCE"),
-        (["track", "--every", "0"], "every must be a positive whole number, not 0"),
-        (["track", "--frames", "5", "--start", "2"], "start is 2.0 s; synthetic (seed 0) has"),
-        (["track", "--scale", "-1"], "scale must be a positive factor"),
         (["track", "--calibration-treatment", "maybe"], "unknown calibration 'maybe'"),
-        (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
         (["track", "--filter", "scale_gauge+lag5"], "modifier lag is no more: a fixed-lag window"),
@@ -150,23 +139,11 @@ jaxslam.cli.main([])
     assert (command.returncode, error) == (141, "")
 
 
-def test_an_interrupted_command_waits_for_nothing_that_compiles():
-    code = """
-import threading, time, jaxslam.cli
-def interrupted(given):
-    threading.Thread(target=time.sleep, args=(100,)).start()
-    raise KeyboardInterrupt
-jaxslam.cli._run = interrupted
-jaxslam.cli.main()
-"""
-    ended = ended_of(code)
-    assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
-
-
 @pytest.mark.parametrize("swallowed", ["as an object ends", "by an import", "as another error"])
-def test_an_interruption_is_heard_wherever_it_comes(swallowed):
+def test_an_interruption_is_heard_wherever_it_comes_and_waits_for_no_thread(swallowed):
     code = f"""
-import os, signal, sys, time, types, jaxslam.cli, jaxslam.cli.commands as commands
+import os, signal, sys, threading, time, types, jaxslam.cli, jaxslam.cli.commands as commands
+threading.Thread(target=time.sleep, args=(100,)).start()
 swallowed = "{swallowed}"
 # A shell's job in the background has it ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)

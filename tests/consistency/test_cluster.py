@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-import jax
 import numpy as np
 import pytest
 from journeys import case, ends
 
 import jaxslam
 from jaxslam.consistency.cluster import on_cluster
-from jaxslam.consistency.montecarlo import ChunkTask, divided, in_threads
-from jaxslam.consistency.simulator import Simulator
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=4, landmarks=3)
@@ -45,7 +42,7 @@ def assert_same(found, wanted):
 
 @contextmanager
 def cluster(workers):
-    """A scheduler's address and the processes of workers, as a person starts them."""
+    """A client, and the processes of workers, as a person starts them."""
     distributed = pytest.importorskip("distributed")
     # Workers compile as the tests do, every program anew, and find the modules of tests.
     told = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true", "JAX_ENABLE_COMPILATION_CACHE": "false"}
@@ -62,29 +59,20 @@ def cluster(workers):
     for _ in range(workers):
         start("worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
     try:
-        yield address, started[1:]
+        with distributed.Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(workers, timeout=90)
+            yield client, started[1:]
     finally:
         for process in started:
             process.kill()
-        for process in started:
             process.wait(30)
-
-
-@pytest.fixture
-def processes():
-    with cluster(workers=2) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
 def client():
     """Of one worker, a process, for all filters."""
-    with cluster(workers=1) as (address, _):
-        from distributed import Client
-
-        with Client(address, timeout=60, set_as_default=False) as client:
-            client.wait_for_workers(1, timeout=90)
-            yield client
+    with cluster(workers=1) as (client, _):
+        yield client
 
 
 MODIFIED = {
@@ -116,36 +104,9 @@ def test_a_filter_ends_in_the_same_bits_wherever_it_was_sent(client, name, world
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_filters_of_every_kind_are_the_same_on_a_cluster(processes):
-    """A worker has other objects for their frames, landmarks and corrections, equal by value."""
-    address, _ = processes
-    from distributed import Client
-
-    worlds = {"laps": ["robocentric+oc+submaps"], "matched-tight": ["invariant", "keyframe"]}
-    few = {"steps": 4, "landmarks": 12}
-    with Client(address, timeout=60, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=90)
-        for name, words in worlds.items():
-            scenario = jaxslam.scenario(name, few | ({"in_view": 4} if name == "laps" else {}))
-            made = jaxslam.make_filters(scenario, words)
-            sizes: dict[str, Any] = {"runs": 4, "chunk": 2, "backend": "xla"}
-            found = jaxslam.monte_carlo(scenario, made, **sizes, cluster=client)
-            wanted = jaxslam.monte_carlo(scenario, made, **sizes)
-            for filter_name in made:
-                ours, theirs = (
-                    [study.store.load(filter_name, chunk) for chunk in study.chunks]
-                    for study in (found, wanted)
-                )
-                assert_same(ours, theirs)
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(180)
-def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes, tmp_path):
-    address, workers = processes
-    from distributed import Client
-
+def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed():
+    """Whole and in sums, which a worker has added up: here two processes share a study."""
     done = []
 
     def progress(name, runs):
@@ -154,8 +115,7 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
             workers[0].send_signal(signal.SIGKILL)
             assert workers[0].wait(30) == -signal.SIGKILL
 
-    with Client(address, timeout=60, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=90)
+    with cluster(workers=2) as (client, workers):
         sizes: dict[str, Any] = {"runs": RUNS, "chunk": CHUNK}
         study = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, cluster=client, progress=progress)
         assert len(client.nthreads()) == 1  # it was killed before the end
@@ -168,34 +128,18 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
         del one["seconds"], other["seconds"]
     assert found == expected
     wanted = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, reduced=True)
-    assert_same(records(sums), records(wanted))  # which the worker has added up
+    assert_same(records(sums), records(wanted))
 
 
-def test_nobody_at_an_address_is_said_in_one_line(monkeypatch):
+def test_nobody_at_an_address_and_no_extra_are_said_in_one_line(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("jaxslam.consistency.cluster.ANSWER_SECONDS", 0.5)
-    told = "no Dask scheduler answers at 'tcp://127.0.0.1:9'"
-    with pytest.raises(ValueError, match=told) as caught:
-        jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
-    assert "\n" not in str(caught.value)
 
+    def refused(message):
+        with pytest.raises(ValueError, match=message) as caught:
+            jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
+        assert "\n" not in str(caught.value)
 
-def test_without_the_extra_a_study_says_what_to_install(monkeypatch):
+    refused("no Dask scheduler answers at 'tcp://127.0.0.1:9'")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(
-        ValueError, match=r"needs the cluster extra .* pip install '\.\[cluster\]'$"
-    ):
-        jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
-
-
-@pytest.mark.slow
-def test_what_computes_a_chunk_survives_a_pickle():
-    """In whatever precision the process is: this one's is float64."""
-    with jax.enable_x64(False):
-        (name, slam) = next(iter(filters().items()))
-        simulator = Simulator(SCENARIO, 5, "float32", 2)
-        task = ChunkTask(name, slam, simulator, simulator.room(divided(4, 2), in_threads))
-        whole = cloudpickle.dumps(task)
-        again = cloudpickle.loads(whole)
-    assert len(whole) < 20_000
-    assert_same([again(range(2, 4))], [task(range(2, 4))])
+    refused(r"needs the cluster extra .* pip install '\.\[cluster\]'$")

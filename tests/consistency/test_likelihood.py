@@ -32,7 +32,7 @@ def scaled(slam, acceleration, pixel, focal=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["robocentric", "world", "scale_gauge"])
+@pytest.mark.parametrize("name", ["robocentric", "scale_gauge"])
 def test_gradients_through_a_run_are_those_of_central_differences(case, name):
     slam, run = jaxslam.cast(case.filter(name), jnp.float64), case.run(0)
     found = eqx.filter_jit(eqx.filter_grad(log_likelihood))(slam, case.room, run)
@@ -50,17 +50,6 @@ def test_gradients_through_a_run_are_those_of_central_differences(case, name):
         h = 1e-5 * jnp.eye(3)[i]
         central = (value(1 + h) - value(1 - h)) / 2e-5
         np.testing.assert_allclose(derivative, central, rtol=1e-5, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_every_number_of_a_filter_has_a_derivative(case):
-    slam = jaxslam.cast(case.filter("robocentric", calibration="white"), jnp.float64)
-    found = eqx.filter_jit(eqx.filter_grad(log_likelihood))(slam, case.room, case.run(0))
-    leaves = jax.tree.leaves(found)
-    assert len(leaves) == len(jax.tree.leaves(slam))
-    assert all(np.isfinite(x).all() for x in leaves)
-    for number in (found.motion.velocity_sigma, found.calibration.sigma, found.depth.mean):
-        assert np.abs(number).max() > 0
 
 
 @pytest.mark.slow

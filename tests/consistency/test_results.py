@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore, Results, Seconds, Study, montecarlo
 from jaxslam.consistency.montecarlo import Interruption
-from jaxslam.plots.consistency import plot_beyond_scale, plot_consistency, plot_nees
+from jaxslam.plots.consistency import plot_beyond_scale, plot_nees
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Verdict, sentences
 
@@ -94,9 +93,8 @@ def test_json_is_made_of_the_results_and_read_back_to_them():
     assert jaxslam.table(told) == jaxslam.table(found) == found.table()
 
 
-@pytest.mark.parametrize("chunk", [10, 7])
-def test_a_study_that_is_saved_and_loaded_is_the_same(chunk, tmp_path, monkeypatch):
-    before, folder = study((1.0, math.nan), chunk=chunk), tmp_path / "mine"
+def test_a_study_that_is_saved_and_loaded_is_the_same(tmp_path, monkeypatch):
+    before, folder = study((1.0, math.nan), chunk=7), tmp_path / "mine"
     assert before.save(folder) == folder
     after = Study.load(folder)
     assert json.dumps(after.summary()) == json.dumps(before.summary())
@@ -129,7 +127,6 @@ def test_a_filter_that_always_diverges_spoils_neither_table_nor_figure(tmp_path)
     table = lost.table()
     assert f"{PAPER}: every run diverged, so that there is no mean" in table
     rows = [line for line in table.splitlines() if line.startswith(PAPER) and "–" in line]
-    assert len(rows) == 2
     assert [row.split()[1:4] for row in rows] == [["–"] * 3] * 2
     assert rows[1].endswith("  lost; –")
     assert lost["robocentric"].verdict.word == "lost"
@@ -138,16 +135,7 @@ def test_a_filter_that_always_diverges_spoils_neither_table_nor_figure(tmp_path)
         assert axes.get_ylim()[1] < 2 * others.get_ylim()[1]
         band, wanted = (x.patches[0].get_extents() for x in (axes, others))
         assert (band.y0, band.y1) == pytest.approx((wanted.y0, wanted.y1), rel=0.2)
-    for shown in (lost, study((math.nan, math.nan))):
-        assert plot_consistency(shown, path=tmp_path / "figure.png").axes
-    assert (tmp_path / "figure.png").stat().st_size > 10_000
-
-
-def test_a_column_has_a_line_for_each_filter():
-    figure = study((3.0, 1.0)).plot(column=True)
-    title = figure.get_suptitle().splitlines()
-    assert title[0].startswith("robocentric: over-confident, σ × 1.")
-    assert len(title) <= 4
+    assert study((math.nan, math.nan)).plot(tmp_path / "figure.png", column=True).axes
 
 
 def test_an_interval_next_to_one_excludes_it_in_words():
@@ -186,17 +174,9 @@ def test_a_notebook_shows_html_and_tables_are_made_where_their_libraries_are(mon
 
 @pytest.mark.parametrize(
     ("runs", "number", "seconds", "chunk"),
-    [
-        (1000, 2, 0.01, 100),
-        (100, 2, 0.01, 12),
-        (200, 2, 0.01, 25),
-        (100, 1, 0.01, 25),
-        (5, 2, 9.0, 100),
-        (1000, 2, 0.3, 50),
-        (1000, 2, 10.0, 12),
-        (10**6, 64, 0.01, 100),
-    ],
-)
+    [(1000, 2, 0.01, 100), (100, 2, 0.01, 12), (100, 1, 0.01, 25), (5, 2, 9, 100),
+     (1000, 2, 0.3, 50), (1000, 2, 10, 12)],
+)  # fmt: skip
 def test_chunks_keep_every_processor_busy_and_a_bar_moving(
     runs, number, seconds, chunk, monkeypatch
 ):
@@ -229,12 +209,10 @@ def test_filters_are_made_of_words_and_what_they_cannot_be_is_said():
         jaxslam.monte_carlo(WORLD, {"mine": "robocentric"})
 
 
-def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    store = FolderStore(Path("here"))
-    assert str(Interruption(20, 60, 10, store)).startswith("20 of 60 runs are kept in here; the sa")
-    told = str(Interruption(0, 60, 10, store))
-    assert told.startswith("no chunk of 10 runs was finished, so that nothing of 60 is kept in her")
+def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path):
+    """What is kept in a folder is a test of the studies that are interrupted."""
+    told = str(Interruption(0, 60, 10, FolderStore(tmp_path)))
+    assert told.startswith("no chunk of 10 runs was finished, so that nothing of 60 is kept in /")
     assert told.endswith("with a chunk smaller than 10 the first runs are kept sooner")
     assert "20 of 60 runs were finished, and are not kept" in str(Interruption(20, 60, 10, None))
 
@@ -246,6 +224,3 @@ def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():
     for dof, runs in ((100, 3), (101, 101)):  # a pose's, and of as many runs as a state has
         low, high = jaxslam.mean_band(dof, runs)
         assert low < dof < high
-    nees = np.random.default_rng(0).chisquare(300, (3, 2))
-    low, high = jaxslam.evaluation.evaluate_nees(nees, 300).band95
-    assert 200 < low < 300 < high < 400

@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
+from cases import FourFunctions
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore, manifest, simulator
@@ -86,13 +87,12 @@ def test_a_store_of_another_study_is_refused(kind, tmp_path, monkeypatch):
 
 def test_another_file_of_the_same_trajectory_is_refused(tmp_path, monkeypatch):
     def written(speed):
-        t = np.arange(12) / 10
         poses = np.tile(np.eye(4), (12, 1, 1))
-        poses[:, 0, 3] = speed * t
-        write_tum(tmp_path / "path.txt", t, poses)
-        return jaxslam.scenario(
-            "matched-6dof", trajectory=str(tmp_path / "path.txt"), steps=3, rate=10.0, landmarks=3
-        )
+        poses[:, 0, 3] = speed * np.arange(12)
+        path = tmp_path / "path.txt"
+        write_tum(path, np.arange(12) / 10, poses)
+        few = {"steps": 3, "rate": 10.0, "landmarks": 3}
+        return jaxslam.scenario("matched-6dof", few, trajectory=str(path))
 
     store = MemoryStore()
     begin(store, monkeypatch, scenario=written(1.0))
@@ -181,8 +181,7 @@ def test_a_description_is_the_same_in_every_process_and_tells_functions_apart():
     told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
     made = jaxslam.make_filters("standstill-6dof", "recommended", "inverse_depth")
     assert difference(json.loads(told.stdout), json.loads(json.dumps(described(made)))) is None
-    told_apart: list[Any] = [lambda x: x + 1, lambda x: x + 2, lambda x: x - 1]
-    told_apart += [adds(1), adds(2)]
+    told_apart: list[Any] = [lambda x: x + 1, lambda x: x - 1, adds(1), adds(2)]
     told_apart += [np.zeros(100), np.zeros((10, 10)), np.ones(100), np.array([1.0]), 1, (1, 2)]
     texts = {json.dumps(described(x)) for x in told_apart}
     assert len(texts) == len(told_apart)
@@ -190,7 +189,7 @@ def test_a_description_is_the_same_in_every_process_and_tells_functions_apart():
 
 
 USERS = """
-import ctypes, math
+import math
 import equinox as eqx
 import helper
 FACTOR = 2
@@ -205,26 +204,24 @@ TOLD = "import json, mine; from jaxslam.consistency.manifest import described; "
 TOLD += "print(json.dumps([described(x()) for x in (Sonar, mine.Sonar)]))"
 
 
-def described_in(run, folder, offset="x"):
-    """The descriptions of a class of the user's, as it is in what is run, and in a module."""
-    (folder / "helper.py").write_text(f"def offset(x):\n    return {offset}\n")
-    (folder / "mine.py").write_text(USERS)
-    (folder / "script.py").write_text(f"{USERS}\n{TOLD}\n")
-    command = [sys.executable, "-B", *run, "script.py"]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
-    told = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder, env=env)
-    return json.loads(told.stdout.splitlines()[-1])
+def test_a_piece_of_the_users_is_the_same_wherever_it_is_written(tmp_path):
+    """In a script, in a module, and in a notebook."""
+    (tmp_path / "helper.py").write_text("def offset(x):\n    return x\n")
+    (tmp_path / "mine.py").write_text(USERS)
+    (tmp_path / "script.py").write_text(f"{USERS}\n{TOLD}\n")
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
 
+    def described_by(*words):
+        told = subprocess.run(
+            [sys.executable, "-B", *words, "script.py"], check=True, capture_output=True, text=True,
+            cwd=tmp_path, env=env,
+        )  # fmt: skip
+        return json.loads(told.stdout.splitlines()[-1])
 
-def test_a_piece_of_the_users_is_the_same_wherever_it_is_written_and_another_with_what_it_calls(
-    tmp_path,
-):
-    first, of_module = described_in([], tmp_path)
-    assert difference(first, of_module) is None
-    assert difference(first, described_in([], tmp_path, offset="2 * x")[0])
+    script, module = described_by()
+    assert difference(script, module) is None
     pytest.importorskip("IPython")
-    in_notebook, _ = described_in(["-m", "IPython", "--no-banner", "--quick"], tmp_path)
-    assert difference(first, in_notebook) is None
+    assert difference(script, described_by("-m", "IPython", "--no-banner", "--quick")[0]) is None
 
 
 def of_source(source):
@@ -262,31 +259,13 @@ def test_code_that_cannot_be_seen_is_named(tmp_path, monkeypatch):
     assert not manifest.unseen(described(SLAM))
 
     with pytest.warns(UserWarning, match=r"not seen: abs\(…\), getattr\(…\) in f; .* resumed"):
-        begin(FolderStore(tmp_path), monkeypatch, slam=own_filter(function))
-
-
-def own_filter(function):
-    class Mine(jaxslam.AbstractFilter):
-        base: jaxslam.AbstractFilter
-
-        def init(self, capacity, first=None, known=None):
-            return self.base.init(capacity, first, known)
-
-        def step(self, state, control, seen, new):
-            return function(self.base.step(state, control, seen, new))
-
-        def marginal(self, state, function):
-            return self.base.marginal(state, function)
-
-        def landmark_marginal(self, state, function, slots):
-            return self.base.landmark_marginal(state, function, slots)
-
-    return Mine(SLAM)
+        begin(FolderStore(tmp_path), monkeypatch, slam=FourFunctions(SLAM, function))
 
 
 def test_a_mended_helper_does_not_resume_the_old_numbers(tmp_path, monkeypatch):
     def mine(sign):
-        return own_filter(of_source(f"def helper(x): return {sign}x\ndef f(x): return helper(x)"))
+        source = f"def helper(x): return {sign}x\ndef f(x): return helper(x)"
+        return FourFunctions(SLAM, of_source(source))
 
     begin(FolderStore(tmp_path), monkeypatch, slam=mine(""))
     study(FolderStore(tmp_path, resume=True), slam=mine(""))

@@ -11,10 +11,10 @@ import pytest
 
 import jaxslam
 from jaxslam.consistency import draw, fit_of, log_likelihood, of_simulation
+from jaxslam.consistency.tuning import NOISE, TuningSettings, _Search
 
 MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
 SENSOR = jaxslam.RangeBearing([0.1, 0.02])
-FIELDS = ("motion.noise_sigma", "sensor.sigma")
 LOGS, STEPS = 4, 40
 
 
@@ -36,13 +36,9 @@ def slam(motion=MOTION, sensor=SENSOR, **pieces):
 
 
 @pytest.fixture(scope="module")
-def wrong():
-    """A filter of which every σ is wrong by factors of 2 to 3."""
-    return slam(jaxslam.Odometry([0.04, 0.015, 0.02]), jaxslam.RangeBearing([0.25, 0.01]))
-
-
-@pytest.fixture(scope="module")
-def tuned(wrong, logs):
+def tuned(logs):
+    """Of a filter of which every σ is wrong by factors of 2 to 2.5."""
+    wrong = slam(jaxslam.Odometry([0.04, 0.015, 0.02]), jaxslam.RangeBearing([0.25, 0.01]))
     return jaxslam.tune(wrong, logs[:LOGS], held_out=logs[LOGS:])
 
 
@@ -52,8 +48,12 @@ def test_every_wrong_noise_is_found_within_its_sigma(tuned):
     for name, values in truth.items():
         off = (tuned.found[name] - values) / tuned.sigma[name]
         assert np.all(np.abs(off) < 3.5), name
-        assert np.all(tuned.sigma[name] < 0.25 * values), name
+        assert np.all(tuned.sigma[name] < 0.25 * np.array(values)), name
     assert tuned.word == "noise"
+    told = str(tuned)
+    assert told.startswith("The noise below explains the innovations")
+    assert "motion.noise_sigma[2]" in told
+    assert json.loads(json.dumps(tuned.to_dict()))["word"] == "noise"
 
 
 def test_the_tuned_filter_is_right_where_the_given_one_was_not(tuned):
@@ -65,32 +65,35 @@ def test_the_tuned_filter_is_right_where_the_given_one_was_not(tuned):
     np.testing.assert_array_equal(tuned.slam.sensor.sigma, tuned.found["sensor.sigma"])
 
 
-def test_a_tuning_shows_itself_as_text_and_as_json(tuned):
-    told = str(tuned)
-    assert told.startswith("The noise below explains the innovations")
-    assert "motion.noise_sigma[2]" in told
-    assert json.loads(json.dumps(tuned.to_dict()))["word"] == "noise"
-
-
-def test_a_bias_that_no_noise_explains_is_a_wrong_model(logs):
-    """The odometry turns by 0.05 rad too little in every step."""
+def test_a_bias_that_no_noise_explains_is_a_wrong_model(tuned, logs):
+    """The odometry turns by 0.05 rad too little in every step; its σ is as large."""
 
     def turned(log):
         control = log.frames.control - jnp.array([0, 0, 0.05])
         return replace(log, frames=log.frames._replace(control=control))
 
-    found = jaxslam.tune(slam(), [turned(log) for log in logs[:2]], ["motion.noise_sigma"])
+    noisy = jaxslam.cast(slam(jaxslam.Odometry([0.02, 0.03, 0.05])), jnp.float64)
+    found = replace(tuned, after=fit_of(noisy, [turned(log) for log in logs[:LOGS]]))
     assert found.word == "model"
     assert "No noise explains" in str(found)
 
 
-def test_a_sigma_of_zero_stays_and_bounds_hold(logs):
-    start = slam(jaxslam.Odometry([0.02, 0.0, 0.01]), jaxslam.RangeBearing([0.1, 0.05]))
-    bounds, priors = {"sensor.sigma": (0.03, 0.5)}, {"motion.noise_sigma": (0.02, 2)}
-    found = jaxslam.tune(start, logs[:2], bounds=bounds, priors=priors)
-    assert found.found["motion.noise_sigma"][1] == 0
-    assert found.found["sensor.sigma"] == pytest.approx([0.1, 0.03], rel=0.1)
-    assert np.isnan(found.sigma["sensor.sigma"]).tolist() == [False, True]
+def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
+    start = slam(jaxslam.Odometry([0.02, 0.0, 0.01]))
+    bounds, priors = {"sensor.sigma": (0.01, 0.5)}, {"motion.noise_sigma": (0.02, 2)}
+    search = _Search.of(start, NOISE, bounds, priors, TuningSettings())
+    np.testing.assert_allclose(search.values(search.first)["motion.noise_sigma"], [0.02, 0, 0.01])
+    np.testing.assert_allclose(search.values(search.first)["sensor.sigma"], [0.1, 0.02])
+    far = search.values(search.first + np.array([0, 9, 0, 99, -99]))
+    assert far["motion.noise_sigma"][1] == 0
+    np.testing.assert_allclose(far["sensor.sigma"], [0.5, 0.01], rtol=1e-6)
+    # In the middle between bounds a σ is that of its logarithm; near one there is none.
+    sigma = search.sigmas(search.first + np.array([0, 0, 0, 99, 0]), 100 * np.eye(5))
+    assert sigma["motion.noise_sigma"] == pytest.approx([0.002, 0, 0.001], rel=0.01)
+    assert np.isnan(sigma["sensor.sigma"]).tolist() == [True, False]
+    # Half of a factor of two is one σ of the prior.
+    cost = search.prior_cost(search.first)
+    assert cost == pytest.approx(0.5 + (np.log(0.02) / np.log(2)) ** 2 / 2, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -101,16 +104,12 @@ def test_a_sigma_of_zero_stays_and_bounds_hold(logs):
         (["sensor.sigma"], {"bounds": {"motion.noise_sigma": (1, 2)}}, "bounds of what is not"),
         (["sensor.sigma"], {"bounds": {"sensor.sigma": (2, 1)}}, "a least and a greatest"),
         (["sensor.sigma"], {"bounds": {"sensor.sigma": (1, 2)}}, "outside its bounds"),
+        (["sensor.sigma"], {"logs": []}, "needs at least one log"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_tuned_is_refused(logs, names, options, message):
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
-        jaxslam.tune(slam(), logs[:1], names, **options)
-
-
-def test_no_log_is_refused():
-    with pytest.raises(ValueError, match="needs at least one log"):
-        jaxslam.tune(slam(), [])
+        jaxslam.tune(slam(), **({"logs": logs[:1], "names": names} | options))
 
 
 def test_a_log_in_frames_gives_the_likelihood_of_its_simulation(simulated):

@@ -12,7 +12,7 @@ from jaxslam.cli import main
 from jaxslam.evaluation import evaluate_log
 from jaxslam.evaluation.convention import MIXED, Convention
 
-STEPS = 300
+STEPS = 200
 TIMES = 1000 + np.arange(STEPS) / 10
 SIGMA = np.repeat([0.05, 0.01], 3)
 TITLES = "t,tx,ty,tz,qx,qy,qz,qw,pxx,pxy,pxz,pyy,pyz,pzz,qrr,qrp,qry,qpp,qpy,qyy"
@@ -20,26 +20,26 @@ TURNS = Rotation.from_euler("ZYX", np.outer(np.sin(TIMES), [0.5, 0.2, 0.1]))
 PLACES = np.outer(np.arange(STEPS), [0.1, 0.02, 0.0])
 
 
-def log(path, seed, factor=1.0, titles=TITLES):
+def log(path, seed, factor=1.0):
     """Poses whose errors are independent, and so many times as large as their covariances say."""
     e = factor * SIGMA * np.random.default_rng(seed).normal(size=(STEPS, 6))
     block = np.array([1, 0, 0, 1, 0, 1])
     P = np.tile([*(SIGMA[0] ** 2 * block), *(SIGMA[3] ** 2 * block)], (STEPS, 1))
     q = (TURNS * Rotation.from_rotvec(e[:, 3:])).as_quat()
-    lines(path, TIMES, PLACES + e[:, :3], q, P, header=titles + "\n", between=",")
+    lines(path, TIMES, PLACES + e[:, :3], q, P, header=TITLES + "\n", between=",")
     return path
 
 
-@pytest.mark.parametrize(("factor", "word"), [(1.0, "cannot tell"), (2.0, "over-confident")])
-def test_two_logs_of_one_run_are_compared_without_a_truth(tmp_path, factor, word):
+def test_two_logs_of_one_run_are_compared_without_a_truth(tmp_path):
     """Their difference has the covariances of both: NEES of (1 + f²)/2 times the degrees."""
-    first, second = log(tmp_path / "a.csv", 0), log(tmp_path / "b.csv", 1, factor)
-    found = evaluate_log(first, against=second)
-    assert found.verdict["word"] == word
-    assert np.mean(found.nees) == pytest.approx(6 * (1 + factor**2) / 2, rel=0.1)
-    assert found.verdict["effective"] > 100
+    first = log(tmp_path / "a.csv", 0)
+    for factor, word in ((1.0, "cannot tell"), (2.0, "over-confident")):
+        found = evaluate_log(first, against=log(tmp_path / "b.csv", 1, factor))
+        assert found.verdict["word"] == word
+        assert np.mean(found.nees) == pytest.approx(6 * (1 + factor**2) / 2, rel=0.1)
+        assert found.verdict["effective"] > 100
     with pytest.raises(ValueError, match="give --truth or --against, not both"):
-        evaluate_log(first, truth=second, against=second)
+        evaluate_log(first, truth=first, against=tmp_path / "b.csv")
     lines(tmp_path / "c.txt", TIMES, PLACES, TURNS.as_quat())
     with pytest.raises(ValueError, match=r"c\.txt has no covariances; --against needs"):
         evaluate_log(first, against=tmp_path / "c.txt")
@@ -68,7 +68,7 @@ def test_the_file_and_the_table_for_latex(tmp_path, capsys):
 def test_a_first_pose_that_is_not_known_moves_all_others():
     """With its covariance added to theirs, NEES of independent errors stays what it is."""
     rng = np.random.default_rng(0)
-    runs, steps = 200, 4
+    runs, steps = 100, 4
     truth = np.tile(np.eye(4), (runs, steps, 1, 1))
     truth[..., 0, 3] = np.arange(steps)
     e = SIGMA * rng.normal(size=(runs, steps, 6))
@@ -79,4 +79,4 @@ def test_a_first_pose_that_is_not_known_moves_all_others():
     P = np.tile(np.diag(SIGMA**2), (runs, steps, 1, 1))
     found = jaxslam.evaluate_poses(estimate, P, truth, Convention(**MIXED), align="first")
     np.testing.assert_allclose(found.nees[:, 0], 0, atol=1e-9)
-    assert np.mean(found.nees[:, 1:]) == pytest.approx(6, rel=0.06)
+    assert np.mean(found.nees[:, 1:]) == pytest.approx(6, rel=0.08)

@@ -14,39 +14,39 @@ def run(offset, seed, sigma=0.005, seconds=20.0, drift=0.0, mounting=None, flat=
     true_times = np.arange(0, seconds, 0.01)
     rates, phases = rng.uniform(1.0, 3.0, (2, 3, 1))
     angles = np.array([[0.3], [0.3], [1.0]]) * np.sin(rates * true_times + 3 * phases)
-    turn = Rotation.from_euler("xyz", angles.T)
     T = np.tile(np.eye(4), (len(true_times), 1, 1))
-    T[:, :3, :3] = turn.as_matrix()
+    T[:, :3, :3] = Rotation.from_euler("xyz", angles.T).as_matrix()
     T[:, :2, 3] = np.stack([np.sin(true_times), true_times], axis=1)
     own = T[::10].copy()
-    walk = drift * np.cumsum(rng.normal(size=(len(own), 3)), axis=0)
-    error = Rotation.from_rotvec(sigma * rng.normal(size=(len(own), 3)) + walk).as_matrix()
-    own[:, :3, :3] = error @ own[:, :3, :3]
+    noise = rng.normal(size=(2, len(own), 3))
+    walk, noise = drift * np.cumsum(noise[0], axis=0), sigma * noise[1]
+    own[:, :3, :3] = Rotation.from_rotvec(noise + walk).as_matrix() @ own[:, :3, :3]
     own[:, :3, 3] += walk
     if mounting is not None:
         own = own @ mounting
     if flat:
         angle = angles[2] + 0.3 * true_times
         T = of_xytheta(np.column_stack([T[:, :2, 3], angle]))
-        noise = sigma * rng.normal(size=len(own)) + walk[:, 0]
-        own = of_xytheta(np.column_stack([T[::10, :2, 2], angle[::10] + noise]))
+        own = of_xytheta(np.column_stack([T[::10, :2, 2], angle[::10] + noise[:, 0]]))
     return true_times[::10] + offset, own, true_times, T
 
 
-def body():
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_euler("xyz", [0.4, 1.2, -2.0]).as_matrix()
-    return X
+BODY = np.eye(4)
+BODY[:3, :3] = Rotation.from_euler("xyz", [0.4, 1.2, -2.0]).as_matrix()
 
 
-@pytest.mark.parametrize("offset", [0.02, -0.02, 0.137])
 @pytest.mark.parametrize(
-    "how",
-    [{}, {"drift": 0.002}, {"mounting": body()}, {"flat": True}, {"seconds": 5.0}],
-    ids=["still", "drifting", "another body", "in the plane", "short"],
+    ("offset", "how"),
+    [
+        (0.02, {"drift": 0.002}),
+        (-0.02, {"mounting": BODY}),
+        (0.137, {"flat": True}),
+        (-0.05, {"seconds": 5.0}),
+    ],
+    ids=["drifting", "another body", "in the plane", "short"],
 )
 def test_an_offset_is_found_within_5_ms_and_its_sigma_is_one(offset, how):
-    found = [clock_offset(*run(offset, seed, **how)) for seed in range(6)]
+    found = [clock_offset(*run(offset, seed, **how)) for seed in range(5)]
     assert all(x is not None and x.found for x in found)
     off = np.array([x.seconds - offset for x in found if x is not None])
     assert np.abs(off).max() < 0.005
@@ -55,10 +55,10 @@ def test_an_offset_is_found_within_5_ms_and_its_sigma_is_one(offset, how):
 
 
 def test_clocks_that_agree_have_no_offset():
-    found = [clock_offset(*run(0.0, seed)) for seed in range(12)]
-    assert all(x is not None for x in found)
-    # Beyond 3 σ is .27 % of Gaussian offsets.
-    assert sum(x.found for x in found if x is not None) == 0
+    for seed in range(6):
+        found = clock_offset(*run(0.0, seed))
+        assert found is not None
+        assert not found.found
 
 
 @pytest.mark.parametrize(

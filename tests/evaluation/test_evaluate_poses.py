@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import verdicts as benchmark
-from cases import quick_rows
 from logs import (
     FIXED,
     LOST,
@@ -17,7 +16,6 @@ from logs import (
     consistent,
     covariance,
     logged,
-    one_run,
     planar,
     some,
     tracked_run,
@@ -33,8 +31,7 @@ from jaxslam.evaluation.alignment import (
     gauge_directions,
     projected,
     similarity,
-    turned_about,
-)
+)  # fmt: skip
 from jaxslam.evaluation.convention import (
     CHOICES,
     alternatives,
@@ -43,7 +40,7 @@ from jaxslam.evaluation.convention import (
     read_covariances,
     truth_derivatives,
     write_covariances,
-)
+)  # fmt: skip
 from jaxslam.evaluation.convention_search import Tried, identify
 from jaxslam.evaluation.inputs import checked_poses
 from jaxslam.evaluation.poses import _constant, estimated, with_truth
@@ -56,17 +53,16 @@ from jaxslam.statistics import Tally, not_disproved
 from jaxslam.statistics.beyond_scale import one_scale
 
 EVERY = [Convention(*c) for c in product(*list(CHOICES.values())[:3])]
-"""Orders are the fastest to change: every second is of another, and they only permute axes."""
+"""Orders are the fastest to change."""
 EACH = [*EVERY[::4], *EVERY[3::4]]
-each_convention = pytest.mark.parametrize(
-    "convention",
-    [pytest.param(c, marks=[pytest.mark.slow] * (c not in EACH), id=str(c)) for c in EVERY],
-)
-"""Errors and axes in one of their two orders; in the other one they are slow."""
+"""Errors and axes in one of their two orders, which only permute axes."""
+SPLIT = Convention("split")
+each_geometry = pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=["plane", "space"])
+
 # --- conventions --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
+@each_geometry
 def test_right_and_left_errors_are_those_of_the_group(geometry):
     T, truth = some(geometry, (5,)), some(geometry, (5,), 1, 0.5)
     of = geometry.group.from_matrix
@@ -83,64 +79,42 @@ def test_the_split_error_is_what_ros_and_error_state_filters_have():
     position = truth[:, :3, 3] - T[:, :3, 3]
     world = Rotation.from_matrix(true @ np.swapaxes(R, 1, 2)).as_rotvec()
     body = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ true).as_rotvec()
-    for axes, turn in (("world", world), ("mixed", body)):
-        expected = np.hstack([position, turn])
+    in_body = np.einsum("nji,nj->ni", R, position)
+    for axes, moved, turn in (
+        ("world", position, world), ("mixed", position, body), ("body", in_body, body)
+    ):  # fmt: skip
+        expected = np.hstack([moved, turn])
         found = pose_errors(Convention("split", axes), T, truth)
         np.testing.assert_allclose(found, expected, atol=1e-9)
         found = pose_errors(Convention("split", axes, "rotation-first"), T, truth)
         np.testing.assert_allclose(found, np.roll(expected, 3, axis=1), atol=1e-9)
-    in_body = np.einsum("nji,nj->ni", R, position)
-    found = pose_errors(Convention("split", "body"), T, truth)
-    np.testing.assert_allclose(found, np.hstack([in_body, body]), atol=1e-9)
 
 
-@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
-@each_convention
-def test_the_change_of_a_convention_is_the_derivative_of_its_error(convention, geometry):
+@each_geometry
+def test_the_change_of_a_convention_is_the_derivative_of_its_error(geometry):
     T, t, step = some(geometry, (2,)), geometry.tangent_dim, 1e-6
-    J = np.stack(
-        [
-            pose_errors(convention, T, benchmark.displaced(T, np.tile(d, (2, 1)), Convention()))
-            for d in step * np.eye(t)
-        ],
-        axis=-1,
-    )
-    np.testing.assert_allclose(J / step, from_right(convention, T), atol=1e-5)
+    steps = [np.tile(d, (2, 1)) for d in step * np.eye(t)]
+    moved = [benchmark.displaced(T, d, Convention()) for d in steps]
     pitch = np.arcsin(-T[:, 2, 0]) if geometry is SPATIAL else np.zeros(2)
-    volume = 1 / np.cos(pitch) if convention.axes == "rpy" else 1
-    determinant = abs(np.linalg.det(from_right(convention, T)))
-    np.testing.assert_allclose(determinant, volume, rtol=1e-9)
+    for convention in EACH:
+        J = np.stack([pose_errors(convention, T, x) for x in moved], axis=-1)
+        np.testing.assert_allclose(J / step, from_right(convention, T), atol=1e-5)
+        volume = 1 / np.cos(pitch) if convention.axes == "rpy" else 1
+        determinant = abs(np.linalg.det(from_right(convention, T)))
+        np.testing.assert_allclose(determinant, volume, rtol=1e-9)
 
 
-@each_convention
+@pytest.mark.parametrize("convention", EACH[::2], ids=str)
 def test_a_filter_that_is_right_is_consistent_in_its_own_convention(convention):
     """Exactly, by construction, whatever the size of the errors."""
-    T, P, truth = logged(convention)
-    found = jaxslam.evaluate_poses(T, P, truth, convention)
+    found = jaxslam.evaluate_poses(*logged(convention), convention)
     assert consistent(found.nees, 6)
     assert found.names[0] == ("x" if convention.order == "position-first" else "rx")
     assert found.identified is not None
     assert convention in found.identified.consistent or not not_disproved(found.verdict)
 
 
-def test_conversion_to_another_convention_and_back_changes_nothing():
-    T, P = some(SPATIAL, (4,)), np.broadcast_to(covariance(6), (4, 6, 6))
-    for new in EVERY:
-        there = converted(P, T, EVERY[0], new)
-        np.testing.assert_allclose(converted(there, T, new, EVERY[0]), P, atol=1e-12)
-        J = change(T, EVERY[0], new)
-        np.testing.assert_allclose(there, J @ P @ np.swapaxes(J, 1, 2), atol=1e-15)
-
-
 # --- the checker --------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_checker_is_right_in_95_of_100_constructed_cases():
-    """And never guesses: the first of the benchmark's two hundred."""
-    said = [benchmark.judged(benchmark.constructed(number, 50)) for number in range(20)]
-    assert said.count("right") >= 19
-    assert said.count("guessed") == 0
 
 
 def test_a_wrong_convention_is_doubted_and_the_right_one_suggested():
@@ -152,6 +126,12 @@ def test_a_wrong_convention_is_doubted_and_the_right_one_suggested():
     found = jaxslam.evaluate_poses(*logged(true), true)
     assert found.suggested is None
     assert "of 14 conventions the stated one (error=left" in str(found)
+    T, P, truth = (np.array(x) for x in logged(true))
+    T[:9, 4:], P[:9, 4:] = np.nan, np.nan
+    assert jaxslam.evaluate_poses(T, P, truth).suggested == true
+    one = jaxslam.evaluate_poses(*logged(Convention("left"), runs=1, steps=50))
+    assert one.suggested is None
+    assert "1 run of 50 steps" in str(one)
 
 
 def test_nothing_is_said_where_conventions_cannot_be_told():
@@ -164,20 +144,6 @@ def test_nothing_is_said_where_conventions_cannot_be_told():
     assert set(found.identified.consistent) == set(alternatives(Convention(), SPATIAL))
     assert "cannot be distinguished from" in str(found)
     assert "; and 10 more" in str(found)
-
-
-def test_one_run_tells_no_convention():
-    found = jaxslam.evaluate_poses(*logged(Convention("left"), runs=1, steps=50))
-    assert found.suggested is None
-    assert "1 run of 50 steps" in str(found)
-
-
-@pytest.mark.parametrize("factor", [0.7, 1.5])
-def test_where_sigma_is_wrong_no_convention_is_blamed(factor):
-    found = jaxslam.evaluate_poses(*logged(Convention(), factor=factor))
-    assert found.identified is not None
-    assert found.identified.consistent == ()
-    assert "no other convention" in str(found)
 
 
 def test_the_checker_asks_for_differences_beyond_scatter_and_of_some_size():
@@ -210,34 +176,18 @@ def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
         assert given.axis_verdict(axis)["word"] != "lost"
 
 
-@pytest.mark.parametrize(("position", "rotation"), [(1.25, 0.8), (0.8, 1.25), (1.08, 1.08)])
-@pytest.mark.parametrize("seed", range(3))
-def test_where_position_and_rotation_are_wrong_no_convention_is_blamed(position, rotation, seed):
+def test_where_sigma_is_wrong_no_convention_is_blamed():
     """A scale of each pose's own took a third of the position's NEES, and made up for its σ."""
-    T, P = some(SPATIAL, (60, 8), seed, 2.0), np.broadcast_to(1e-4 * np.eye(6), (60, 8, 6, 6))
-    factors = np.repeat([position, rotation], 3)
-    noise = 1e-2 * factors * np.random.default_rng(seed).normal(size=(60, 8, 6))
-    found = jaxslam.evaluate_poses(T, P, benchmark.displaced(T, noise, Convention()), Convention())
-    assert found.identified is not None
-    assert not found.identified.doubtful
-
-
-@pytest.mark.parametrize("factor", quick_rows(1, [1.12, 0.9, 1.06, 1.5]))
-def test_all_runs_are_asked_for_a_convention_and_none_excuses_sigma(factor):
-    for number in range(2):
-        case = benchmark.with_factors(number, 150, factor, factor)
+    for number, factors in enumerate(((1.25, 0.8), (1.08, 1.08), (0.7, 0.7))):
+        case = benchmark.with_factors(number, 60, *factors)
         found = jaxslam.evaluate_poses(*case[1:4], case.stated)
         assert found.identified is not None
         assert not found.identified.doubtful
+        assert factors != (0.7, 0.7) or found.identified.consistent == ()
+    assert "no other convention" in str(found)
 
 
-def test_of_one_file_only_one_convention_is_said_to_be_the_only_one():
-    """Of right and split, the same to first order, neither; nor one beside which another stands."""
-    T, P, truth = logged(Convention("right", "body"), spread=0.3)
-    for error in ("right", "split"):
-        told = str(jaxslam.evaluate_poses(T, P, truth, Convention(error, "body")))
-        assert "right and split errors are the same to first order" in told
-        assert "the only one" not in told
+def test_a_convention_beside_which_the_stated_one_stands_is_not_the_only_one():
     nees = np.random.default_rng(0).chisquare(6, size=(20, 10))
     tried = {Convention(): Tried(nees, 6), Convention("left"): Tried(1.06 * nees, 6)}
     found = identify(Convention("left"), tried)
@@ -245,17 +195,20 @@ def test_of_one_file_only_one_convention_is_said_to_be_the_only_one():
     assert found.stands
     assert "fits the same runs better, NEES" in found.sentence
     assert "only" not in found.sentence
+    # Nor is one of right and split, which are the same to first order.
+    told = str(jaxslam.evaluate_poses(*logged(Convention("right", "body"), spread=0.3)))
+    assert "right and split errors are the same to first order" in told
+    assert "the only one" not in told
 
 
 # --- axes that are not estimated ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("other", [0.0, 1e-6, 1e6])
-@pytest.mark.parametrize("vertical", [1, 2])
+@pytest.mark.parametrize(("other", "vertical"), [(0.0, 1), (1e6, 2)])
 def test_axes_that_are_not_estimated_have_no_degree_of_freedom(other, vertical):
     for factor, right in ((1.0, True), (0.6, False)):
         *poses, nees = planar(factor=factor, other=other, vertical=vertical)
-        found = jaxslam.evaluate_poses(*poses, Convention("split"))
+        found = jaxslam.evaluate_poses(*poses, SPLIT)
         assert found.names == (("x", "y", "rz") if vertical == 2 else ("x", "z", "ry"))
         assert found.dof == 3
         np.testing.assert_allclose(found.nees, nees, rtol=1e-6)
@@ -269,36 +222,16 @@ def test_axes_that_are_not_estimated_have_no_degree_of_freedom(other, vertical):
 def test_a_wrong_convention_of_a_planar_robot_is_found_too():
     *poses, _ = planar()
     for stated in (Convention("split", "world", "rotation-first"), Convention("split", "body")):
-        assert jaxslam.evaluate_poses(*poses, stated).suggested == Convention("split")
-
-
-@pytest.mark.slow
-def test_axes_used_may_be_said_and_the_first_pose_known_on_them():
-    T, P, truth, nees = planar()
-    found = jaxslam.evaluate_poses(T, P, truth, Convention("split"), axes_used="rz,x")
-    assert found.names == ("x", "rz")
-    assert found.notes == ()
-    P = P.copy()
-    P[:, 0, [0, 1, 5]], T[:, 0] = 0, truth[:, 0]
-    P[:, 0, :, [0, 1, 5]] = 0
-    turned = Rotation.from_rotvec([0, 0, 2.0]).as_matrix()  # in the plane of the robot
-    T, P = elsewhere(T, P, Convention("split"), MOTION._replace(rotation=turned))
-    for axes in ("", "x,y,rz"):
-        there = jaxslam.evaluate_poses(
-            *(T, P, truth, Convention("split")), align="se3", axes_used=axes
-        )
-        assert there.dof == 3
-        assert "aligned at the first pose" in str(there)
-        np.testing.assert_allclose(there.nees, nees[:, 1:], rtol=1e-4)
+        assert jaxslam.evaluate_poses(*poses, stated).suggested == SPLIT
 
 
 def test_of_the_axes_used_alone_a_folder_is_evaluated_and_drawn(tmp_path):
     *poses, _ = planar(runs=3)
-    write_runs(tmp_path, *poses, Convention("split"))
-    found = jaxslam.evaluate_log(tmp_path, axes_used="x,y,rz")
-    assert found.names == ("x", "y", "rz")
+    write_runs(tmp_path, *poses, SPLIT)
+    found = jaxslam.evaluate_log(tmp_path, axes_used="rz,x")
+    assert found.names == ("x", "rz")
     axes = new_figure(4, 3).subplots()
-    labels = [plot_axis(found, axis, ax=axes).get_ylabel() for axis in (0, 2)]
+    labels = [plot_axis(found, axis, ax=axes).get_ylabel() for axis in (0, 1)]
     assert labels == ["m, or map units", "rad"]
 
 
@@ -309,7 +242,7 @@ def test_an_axis_of_small_errors_is_estimated_where_it_is_correlated(correlation
     T, P = T.copy(), P.copy()
     T[..., 2, 3] += 1e-6 * np.random.default_rng(1).normal(size=T.shape[:2])
     P[..., 0, 2] = P[..., 2, 0] = correlation * np.sqrt(P[..., 0, 0] * P[..., 2, 2])
-    used, notes = estimated(checked_poses(T, P, truth), Convention("split"), "none")
+    used, notes = estimated(checked_poses(T, P, truth), SPLIT, "none")
     assert ("z" not in used) == left_out
     assert notes
 
@@ -325,24 +258,20 @@ def test_axes_whose_variance_never_changes_stand_out_only_beside_others():
 
 # --- one scale a run ----------------------------------------------------------------------------
 
+DRIFT = benchmark.ScaleDrift(runs=30, steps=40)
+
 
 @pytest.mark.parametrize("kind", benchmark.RIGHT)
 def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common(kind):
-    options = benchmark.ScaleDrift(runs=30, steps=40)
-    for seed in range(3):
-        word, named = benchmark.judged_drift(kind, 0.0, options, seed)
-        assert word in ("consistent", "cannot tell")
-        assert not named
+    word, named = benchmark.judged_drift(kind, 0.0, DRIFT, 0)
+    assert word in ("consistent", "cannot tell")
+    assert not named
 
 
-@pytest.mark.slow
-def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
+def test_a_drift_of_scale_is_over_confident_and_named():
     """Each pose at a scale of its own had hidden it, be it fourfold."""
-    options = benchmark.ScaleDrift(runs=30, steps=40)
-    for drift in (0.05, float(np.log(4))):
-        for seed in range(3):
-            assert benchmark.judged_drift("drift", drift, options, seed) == ("over-confident", True)
-    arrays = benchmark.drifting("drift", float(np.log(4)), options, 0)
+    assert benchmark.judged_drift("drift", 0.05, DRIFT, 0) == ("over-confident", True)
+    arrays = benchmark.drifting("drift", float(np.log(4)), DRIFT, 0)
     found = jaxslam.evaluate_poses(*arrays, benchmark.SPLIT, align="sim3")
     assert "the scale drifts by" in found.headline
     assert "times its σ: over-confident" in found.headline
@@ -352,7 +281,6 @@ def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
     drift = np.array(scale["drift"])
     # Of log s, from the first poses that tell it to the last one; relative to the run's.
     assert drift[-2] - drift[2] == pytest.approx(np.log(4) * 35 / 39, rel=0.05)
-    plot_evaluation(found, tmp_path / "evaluation.png")
     panels = [axes.get_title() for axes in plot_evaluation(found).axes]
     assert sum(title.startswith("scale") for title in panels) == 1
 
@@ -377,17 +305,22 @@ def test_the_size_of_a_drift_is_that_of_the_poses_that_tell_it():
     assert found.rms == pytest.approx(np.sqrt((100 * 0.2**2 + 1) / 101), rel=1e-12)
 
 
+def jointly(joint, convention, runs, steps):
+    """Paths, joint covariances, and truths whose errors along a whole run are drawn from them."""
+    T = np.tile(some(SPATIAL, (1, steps), 3, 2.0), (runs, 1, 1, 1))
+    noise = np.random.default_rng(5).normal(size=(runs, 6 * steps)) @ np.linalg.cholesky(joint).T
+    truth = benchmark.displaced(T, noise.reshape(runs, steps, 6), convention)
+    return T, np.broadcast_to(joint, (runs, *joint.shape)), truth
+
+
 def test_with_the_joint_covariance_the_scale_is_the_exact_one():
     """Errors with most of them common: each NEES has all of its degrees of freedom, and the drift
     its one; the least sum over s is found."""
-    convention, runs, steps = Convention("split", "world", scale="given"), 300, 5
-    T = np.tile(some(SPATIAL, (1, steps), 3, 2.0), (runs, 1, 1, 1))
+    convention, steps = Convention("split", "world", scale="given"), 5
     root = np.random.default_rng(1).normal(size=(6 * steps, 6 * steps))
     joint = 1e-6 * (root @ root.T + np.eye(6 * steps))
-    noise = np.random.default_rng(5).normal(size=(runs, 6 * steps)) @ np.linalg.cholesky(joint).T
-    truth = benchmark.displaced(T, noise.reshape(runs, steps, 6), convention)
+    T, joints, truth = jointly(joint, convention, 300, steps)
     truth[..., :3, 3] *= 1.7
-    joints = np.broadcast_to(joint, (runs, *joint.shape))
     found = jaxslam.evaluate_poses(T, joints, truth, convention)
     assert (found.dof, found.fitted) == (6, 0.0)
     assert found.scale is not None
@@ -413,9 +346,8 @@ MOTION = Similarity(Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.array
 
 def moved_covariances(motion, P, T, convention):
     """Covariances of errors of the poses T in another world."""
-    split = Convention("split")
-    own = motion.block @ converted(P, T, convention, split) @ motion.block.T
-    return converted(own, motion.moved(T), split, convention)
+    own = motion.block @ converted(P, T, convention, SPLIT) @ motion.block.T
+    return converted(own, motion.moved(T), SPLIT, convention)
 
 
 def elsewhere(T, P, convention, motion):
@@ -426,18 +358,17 @@ def elsewhere(T, P, convention, motion):
     return motion.moved(flat).reshape(shape), moved.reshape(P.shape)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
-@pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_alignment_by_all_positions_undoes_a_motion_of_the_world(convention, scale):
-    T, P, truth = logged(convention, runs=4, steps=12, spread=2.0)
-    align = "se3" if scale == 1 else "sim3"
-    moved = elsewhere(T, P, convention, MOTION._replace(scale=scale))
+@pytest.mark.parametrize(
+    ("convention", "align"), [(Convention("left"), "sim3"), (Convention("right", "world"), "se3")]
+)
+def test_alignment_by_all_positions_undoes_a_motion_of_the_world(convention, align):
+    T, P, truth = logged(convention, spread=2.0)
+    motion = MOTION._replace(scale=1.0 if align == "se3" else 0.3)
+    moved = elsewhere(T, P, convention, motion)
     here = jaxslam.evaluate_poses(T, P, truth, convention, align=align)
     there = jaxslam.evaluate_poses(*moved, truth, convention, align=align)
-    np.testing.assert_allclose(there.nees, here.nees, rtol=1e-6)
-    np.testing.assert_allclose(there.rmse, here.rmse, rtol=1e-6)
-    np.testing.assert_allclose(there.sigma, here.sigma, rtol=1e-6)
+    for name in ("nees", "rmse", "sigma"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=1e-6)
 
 
 def test_a_moved_covariance_is_that_of_moved_errors():
@@ -449,60 +380,48 @@ def test_a_moved_covariance_is_that_of_moved_errors():
     truth = benchmark.displaced(T, noise, convention)
     errors = pose_errors(convention, motion.moved(T), motion.moved(truth))[0]
     expected = moved_covariances(motion, P[None], T[0, :1], convention)[0]
-    sigma = np.sqrt(np.diag(expected))
+    both = np.outer(sigma := np.sqrt(np.diag(expected)), sigma)
     # Of 40 000 draws the correlations scatter by .005.
-    np.testing.assert_allclose(
-        np.cov(errors.T) / sigma / sigma[:, None], expected / sigma / sigma[:, None], atol=0.03
-    )
+    np.testing.assert_allclose(np.cov(errors.T) / both, expected / both, atol=0.03)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("scaled", [False, True])
-def test_the_oblique_projection_is_what_alignment_does_to_errors(scaled):
+def test_the_oblique_projection_is_what_alignment_does_to_errors():
     """A joint covariance with most of its errors common to all poses, as a SLAM's: the NEES of
     aligned poses is χ² with the projected covariance, and far too small with the first one."""
-    convention, steps, runs = Convention("split", "world"), 6, 40
-    T = np.tile(some(SPATIAL, (1, steps), 3, 2.0), (runs, 1, 1, 1))
-    U = gauge_directions(T[0], "sim3" if scaled else "se3").reshape(6 * steps, -1)
+    steps, runs = 6, 40
+    U = gauge_directions(some(SPATIAL, (1, steps), 3, 2.0)[0], "sim3").reshape(6 * steps, -1)
     own = np.kron(np.eye(steps), 1e-6 * np.diag([1, 4, 9, 1, 2, 3]))
     joint = own + 1e-4 * U @ U.T
-    noise = np.random.default_rng(5).normal(size=(runs, 6 * steps)) @ np.linalg.cholesky(joint).T
-    truth = benchmark.displaced(T, noise.reshape(runs, steps, 6), convention)
-    align = "sim3" if scaled else "se3"
-    joints = np.broadcast_to(joint, (runs, *joint.shape))
-    found = jaxslam.evaluate_poses(T, joints, truth, convention, align=align)
+    T, joints, truth = jointly(joint, SPLIT, runs, steps)
+    found = jaxslam.evaluate_poses(T, joints, truth, SPLIT, align="sim3")
     for step in range(steps):
         assert consistent(found.nees[:, step], 6)
     assert "joint covariance is projected" in str(found)
-    blocks = found.sigmas[0] ** 2
-    assert blocks.mean() < 0.1 * np.diag(joint).mean()
+    assert (found.sigmas[0] ** 2).mean() < 0.1 * np.diag(joint).mean()
+
+
+def diagonal(blocks):
+    """A matrix of blocks (k, n, n) on its diagonal."""
+    count, n = blocks.shape[:2]
+    return np.einsum("kij,kl->kilj", blocks, np.eye(count)).reshape(count * n, count * n)
 
 
 def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
     T, P = some(SPATIAL, (5,), 2), np.stack([covariance(6, seed) for seed in range(5)])
-    joint = np.zeros((30, 30))
-    for k in range(5):
-        joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = P[k]
-    one, other = (projected(T, x, align="sim3") for x in (P, joint))
+    one, other = (projected(T, x, align="sim3") for x in (P, diagonal(P)))
     np.testing.assert_allclose(one, other, atol=1e-12)
     U = gauge_directions(T, "sim3")
     V = U.copy()
     V[:, 3:] = 0
-    Q = (
-        np.eye(30)
-        - U.reshape(30, 7)
-        @ np.linalg.inv(V.reshape(30, 7).T @ U.reshape(30, 7))
-        @ V.reshape(30, 7).T
-    )
-    whole = Q @ joint @ Q.T
+    U, V = U.reshape(30, 7), V.reshape(30, 7)
+    Q = np.eye(30) - U @ np.linalg.inv(V.T @ U) @ V.T
+    whole = (Q @ diagonal(P) @ Q.T).reshape(5, 6, 5, 6)
     for k in range(5):
-        block = whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        np.testing.assert_allclose(one[k], block, atol=1e-12)
+        np.testing.assert_allclose(one[k], whole[k, :, k], atol=1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("convention", [Convention("left"), Convention("split")])
-def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there(convention):
+def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there():
+    convention = Convention("left")
     T, P, truth = logged(convention)
     P, truth = P.copy(), truth.copy()
     P[:, 0], truth[:, 0] = 0, T[:, 0]
@@ -516,46 +435,27 @@ def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there(convention):
     larger = elsewhere(T, P, convention, MOTION._replace(scale=3.0))
     free = jaxslam.evaluate_poses(*larger, truth, convention, align="sim3")
     assert free.dof == 6
-    sums = (found.nees.sum(axis=1) for found in (free, there))
-    assert (next(sums) <= next(sums) * (1 + 1e-6)).all()
+    assert (free.nees.sum(axis=1) <= there.nees.sum(axis=1) * (1 + 1e-6)).all()
     assert not_disproved(free.verdict)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("align", ["se3", "sim3"])
-def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
+def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise():
     """Ten metres straight on, each pose with an error of 5 cm and .01 rad, of its own."""
-    runs, steps, sigma = 40, 50, np.repeat([0.05, 0.01], 3)
-    truth = np.tile(np.eye(4), (runs, steps, 1, 1))
-    truth[..., 0, 3] = np.linspace(0, 10, steps)
+    runs, steps, sigma = 40, 6, np.repeat([0.05, 0.01], 3)
     noise = sigma * np.random.default_rng(0).normal(size=(runs, steps, 6))
-    T, P = truth.copy(), np.broadcast_to(np.diag(sigma**2), (runs, steps, 6, 6))
-    T[..., :3, 3] += noise[..., :3]
     turn = Rotation.from_rotvec(noise[..., 3:].reshape(-1, 3)).as_matrix()
-    T[..., :3, :3] = turn.reshape(runs, steps, 3, 3)
-    convention = Convention("split")
-    found = jaxslam.evaluate_poses(
-        *elsewhere(T, P, convention, MOTION), truth, convention, align=align
-    )
-    assert not_disproved(found.verdict)
-    assert "straight line" in str(found)
-    bent = truth.copy()
-    bent[..., 1, 3] = np.sin(truth[..., 0, 3])
-    T[..., 1, 3] += bent[..., 1, 3]
-    curve = jaxslam.evaluate_poses(T, P, bent, convention, align=align)
-    assert not_disproved(curve.verdict)
-    assert "straight line" not in str(curve)
-
-
-def test_a_rotation_about_a_line_is_that_of_the_orientations():
-    """However far it is to turn, where the positions are on the line and say nothing of it."""
-    line = np.array([2.0, -1.0, 2.0]) / 3
-    T = some(SPATIAL, (5,)).copy()
-    T[:, :3, 3] = np.outer(np.arange(5.0), line)
-    turned = Similarity(Rotation.from_rotvec(2.2 * line).as_matrix(), np.ones(3), 1.0)
-    found = turned_about(Similarity(np.eye(3), np.zeros(3), 1.0), line, T, turned.moved(T))
-    np.testing.assert_allclose(found.rotation, turned.rotation, atol=1e-12)
-    np.testing.assert_allclose(found.translation, turned.translation, atol=1e-12)
+    P = np.broadcast_to(np.diag(sigma**2), (runs, steps, 6, 6))
+    for straight in (True, False):
+        truth = np.tile(np.eye(4), (runs, steps, 1, 1))
+        truth[..., 0, 3] = along = np.linspace(0, 10, steps)
+        truth[..., 1, 3] = 0 if straight else np.sin(along)
+        T = truth.copy()
+        T[..., :3, 3] += noise[..., :3]
+        T[..., :3, :3] = turn.reshape(runs, steps, 3, 3)
+        moved = elsewhere(T, P, SPLIT, MOTION)
+        found = jaxslam.evaluate_poses(*moved, truth, SPLIT, align="sim3")
+        assert not_disproved(found.verdict)
+        assert ("straight line" in str(found)) == straight
 
 
 def test_pairs_and_fits_are_those_of_evo():
@@ -563,50 +463,36 @@ def test_pairs_and_fits_are_those_of_evo():
     sync = pytest.importorskip("evo.core.sync")
     trajectory = pytest.importorskip("evo.core.trajectory")
     rng = np.random.default_rng(0)
-    for seed in range(20):
-        n, m = rng.integers(3, 40, size=2)
-        a, b = (np.sort(rng.uniform(0, 0.1, size)) for size in (n, m))
 
-        def evos(times):
-            still = np.tile([1.0, 0, 0, 0], (len(times), 1))
-            return trajectory.PoseTrajectory3D(np.zeros((len(times), 3)), still, times)
+    def evos(times):
+        still = np.tile([1.0, 0, 0, 0], (len(times), 1))
+        return trajectory.PoseTrajectory3D(np.zeros((len(times), 3)), still, times)
 
+    for _ in range(8):
+        a, b = (np.sort(rng.uniform(0, 0.1, size)) for size in rng.integers(3, 40, size=2))
         ours, theirs = associated(a, b)
         first, second = sync.associate_trajectories(evos(a), evos(b), max_diff=0.01)
         np.testing.assert_array_equal(a[ours], first.timestamps)
         np.testing.assert_array_equal(b[theirs], second.timestamps)
-        x, y = rng.normal(size=(2, 10, 3))
-        for scaled in (False, True):
-            R, t, s = core.umeyama_alignment(x.T, y.T, scaled)
-            found = similarity(x, y, scaled=scaled)
-            np.testing.assert_allclose(found.rotation, R, atol=1e-9, err_msg=str(seed))
-            np.testing.assert_allclose(found.translation, t, atol=1e-9)
-            assert found.scale == pytest.approx(s)
+    x, y = rng.normal(size=(2, 10, 3))
+    for scaled in (False, True):
+        found, wanted = similarity(x, y, scaled=scaled), core.umeyama_alignment(x.T, y.T, scaled)
+        for ours, theirs in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
-# --- runs that are not equally long ---------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("joint", [False, True])
-@pytest.mark.parametrize("align", ["none", "se3", "sim3"])
+@pytest.mark.parametrize(("align", "joint"), [("se3", True), ("sim3", False)])
 def test_poses_that_were_not_logged_change_nothing_of_the_others(align, joint):
     """A run that is padded, and one with a gap in its truth, are the runs without those steps."""
     T, P, truth = (np.array(x) for x in logged(Convention("left"), runs=3, steps=8))
     T[1, 5:, :3], P[1, 5:], truth[2, 3] = np.nan, np.nan, np.nan
-    kept = [np.arange(8), np.arange(5), np.delete(np.arange(8), 3)]
 
     def evaluated(T, P, truth):
-        if joint:
-            runs, steps = P.shape[:2]
-            whole = np.zeros((runs, 6 * steps, 6 * steps))
-            for k in range(steps):
-                whole[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = P[:, k]
-            P = whole
-        return jaxslam.evaluate_poses(T, P, truth, Convention("left"), align=align)
+        whole = np.stack([diagonal(run) for run in P]) if joint else P
+        return jaxslam.evaluate_poses(T, whole, truth, Convention("left"), align=align)
 
     found = evaluated(T, P, truth)
-    for run, steps in enumerate(kept):
+    for run, steps in enumerate([np.arange(8), np.arange(5), np.delete(np.arange(8), 3)]):
         alone = evaluated(*(x[run : run + 1, steps] for x in (T, P, truth)))
         np.testing.assert_allclose(found.nees[run, steps], alone.nees[0], rtol=1e-9)
         np.testing.assert_allclose(found.errors[run, steps], alone.errors[0], atol=1e-12)
@@ -616,39 +502,18 @@ def test_poses_that_were_not_logged_change_nothing_of_the_others(align, joint):
     json.dumps(found.asdict(), allow_nan=False)
 
 
-def test_conventions_are_told_from_runs_of_unlike_length_too():
-    true = Convention("left", order="rotation-first")
-    T, P, truth = (np.array(x) for x in logged(true))
-    T[:9, 4:], P[:9, 4:] = np.nan, np.nan
-    assert jaxslam.evaluate_poses(T, P, truth).suggested == true
-
-
 # --- text and folders; that each format is its arrays is a law of logs ----------------------------
-
-
-@pytest.mark.parametrize("convention", [*EVERY[::3], Convention(scale="given")], ids=str)
-def test_a_covariance_file_says_its_convention(tmp_path, convention):
-    P = np.stack([covariance(6, seed) for seed in range(3)])
-    write_covariances(tmp_path / "c.txt", [0, 0.5, 1], P, convention, remark="by me; all of it")
-    found = read_covariances(tmp_path / "c.txt")
-    np.testing.assert_allclose(found.covariances, P, rtol=1e-9)
-    np.testing.assert_array_equal(found.times, [0, 0.5, 1])
-    assert found.convention == convention
-    assert (tmp_path / "c.txt").read_text().count("#") == 1
-
-
-def upper(P):
-    return " ".join(str(x) for x in P[np.triu_indices(6)])
 
 
 def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
     path, P = tmp_path / "c.txt", covariance(6)
-    path.write_text(f"# made by my filter\n# angle=deg order=rotation-first\n\n0, {upper(P)}\n")
+    upper = " ".join(str(x) for x in P[np.triu_indices(6)])
+    path.write_text(f"# made by my filter\n# angle=deg order=rotation-first\n\n0, {upper}\n")
     found = read_covariances(path)
     unit = np.repeat([np.pi / 180, 1.0], 3)
     np.testing.assert_allclose(found.covariances[0], P * unit * unit[:, None], rtol=1e-12)
     assert found.said == {"order": "rotation-first"}
-    path.write_text(f"0 {upper(P)}\n")
+    path.write_text(f"0 {upper}\n")
     assert read_covariances(path).convention == Convention()
 
 
@@ -669,26 +534,9 @@ def test_a_folder_of_runs_is_its_arrays_and_what_is_stated_comes_before_what_fil
     assert jaxslam.evaluate_log(tmp_path, stated=stated).convention == Convention("left", "world")
 
 
-def test_lost_runs_have_the_names_of_their_folders(tmp_path):
-    T, P, truth = (np.array(x) for x in logged(Convention(), runs=4))
-    truth[2, 3:, :3, 3] += 50.0
-    write_runs(tmp_path, T, P, truth, Convention())
-    found = jaxslam.evaluate_log(tmp_path)
-    assert found.asdict()["lost_runs"] == ["run02"]
-    assert found.asdict()["run_names"] == ["run00", "run01", "run02", "run03"]
-    assert "lost: run02" in str(found).splitlines()
-
-
-def test_poses_may_be_positions_and_rotation_vectors():
-    T, P, truth = logged(Convention(), runs=2)
-    turns = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
-    written = np.concatenate([T[..., :3, 3], turns.reshape(*T.shape[:2], 3)], axis=-1)
-    found, wanted = (jaxslam.evaluate_poses(x, P, truth) for x in (written, T))
-    np.testing.assert_allclose(found.nees, wanted.nees, rtol=1e-9)
-
-
-def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_path):
-    T, P, truth = logged(Convention(), runs=3)
+def test_runs_in_folders_are_compared_as_far_as_each_goes_and_named_where_they_are_lost(tmp_path):
+    T, P, truth = (np.array(x) for x in logged(Convention(), runs=3))
+    truth[0, 3:, :3, 3] += 50.0
     write_runs(tmp_path, T, P, truth, Convention())
     times = np.arange(6) / 10
     write_tum(tmp_path / "run01" / "truth.txt", times[:4], truth[1, :4])
@@ -700,26 +548,14 @@ def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_p
     there[1, 4:], there[2, 5:] = False, False
     np.testing.assert_array_equal(found.logged, there)
     np.testing.assert_allclose(found.nees[there], arrays.nees[there], rtol=1e-4)
-    assert "3 of 18 steps are not compared (run01: 2, run02: 1)" in str(found)
-    assert "2 of 17 poses have no truth, and are left out" in str(found)
-    assert "1 of 18 covariances are at no time of the estimate" in str(found)
-    assert "runs have 5 to 6 poses" in str(found)
-
-
-def test_files_of_other_rates_are_compared_where_they_meet(tmp_path):
-    """A truth of every third pose is compared whole, as one of ten times as many is."""
-    run = one_run(tmp_path / "run", shown=None)
-    lines = (run / "truth.txt").read_text().splitlines()
-    (run / "truth.txt").write_text("\n".join(lines[1::3]))
-    found = jaxslam.evaluate_log(run)
-    assert found.logged.sum() == 14
-    assert "26 of 40 poses have no truth" in str(found)
-
-
-def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path):
-    T, P, truth = logged(Convention(), runs=2)
-    write_runs(tmp_path, T, P, truth, Convention())
-    assert "steps are counted" not in str(jaxslam.evaluate_log(tmp_path))
+    told, written = str(found), found.asdict()
+    assert "3 of 18 steps are not compared (run01: 2, run02: 1)" in told
+    assert "2 of 17 poses have no truth, and are left out" in told
+    assert "1 of 18 covariances are at no time of the estimate" in told
+    assert "runs have 5 to 6 poses" in told
+    assert written["lost_runs"] == ["run00"]
+    assert written["run_names"] == ["run00", "run01", "run02"]
+    assert "steps are counted" not in told
     slower = np.arange(6) / 5
     write_tum(tmp_path / "run01" / "estimate.txt", slower, T[1])
     write_covariances(tmp_path / "run01" / "covariance.txt", slower, P[1], Convention())
@@ -728,18 +564,21 @@ def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path)
     assert "their times differ between runs, and are those of run00" in told
 
 
+# --- the tracker's files --------------------------------------------------------------------------
+
+
 def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     trajectory = pytest.importorskip("jaxslam.tracking.trajectory")
-    T, P, truth = logged(trajectory.TRACKED, runs=1, steps=300)
+    T, P, truth = logged(trajectory.TRACKED, runs=1, steps=100)
     T, P, truth = T[0], P[0].copy(), truth[0].copy()
     P[0], truth[0] = 0, T[0]
-    times = np.arange(300) / 30
+    times = np.arange(100) / 30
     write_tum(tmp_path / "trajectory.txt", times, T)
     trajectory.write_covariances(tmp_path / "covariance.txt", times, P, given_scale=True)
     write_tum(tmp_path / "groundtruth.txt", times, truth)
     found = jaxslam.evaluate_log(tmp_path)
     assert found.convention == replace(trajectory.TRACKED, scale="given")
-    assert (found.dof, found.steps, found.fitted) == (6, 299, 1.0)
+    assert (found.dof, found.steps, found.fitted) == (6, 99, 1.0)
     best = errors_beyond_scale(trajectory.TRACKED, T[1:], truth[1:], P[1:])
     nees = one_scale(*(np.asarray(x) for x in best)).nees
     np.testing.assert_allclose(found.nees[0], nees, rtol=1e-4)
@@ -756,12 +595,14 @@ def test_frames_that_the_tracker_says_nothing_of_the_unit_of_are_left_out(tmp_pa
     np.testing.assert_allclose(found.nees[0, :60], expected.nees[0], rtol=1e-4)
     assert found.logged.sum() == 60
     assert found.alignment == "sim3"
-    told = str(found)
-    assert "aligned at the first pose" in told
-    assert "map 0, the longest, is evaluated" in told
-    assert "21 of 96 poses are of other maps" in told
-    assert "5 of 96 poses are of frames that are lost" in told
-    assert "9 of 96 poses are from before the unit of their map was fixed" in told
+    for said in (
+        "aligned at the first pose",
+        "map 0, the longest, is evaluated",
+        "21 of 96 poses are of other maps",
+        "5 of 96 poses are of frames that are lost",
+        "9 of 96 poses are from before the unit of their map was fixed",
+    ):
+        assert said in str(found)
     late = jaxslam.evaluate_log(tmp_path, align="sim3", time_offset=1 / 30)
     assert late.logged.sum() == 60  # its frames are found by their own stamps
     (tmp_path / "frames.csv").unlink()
@@ -780,18 +621,7 @@ def test_a_later_map_that_is_the_longest_is_evaluated_in_its_own_unit(tmp_path):
         jaxslam.evaluate_log(tmp_path)
 
 
-def test_of_several_videos_poses_that_are_left_out_are_counted_together(tmp_path):
-    for name, frames in (("a", [*30 * [FIXED], LOST]), ("b", [*40 * [FIXED], *2 * [LOST]])):
-        (tmp_path / name).mkdir()
-        tracked_run(tmp_path / name, [frames])
-    found = jaxslam.evaluate_log(tmp_path, align="sim3")
-    assert "3 of 73 poses are of frames that are lost" in str(found)
-    assert found.logged.sum(axis=1).tolist() == [29, 39]
-
-
-@pytest.mark.parametrize(
-    "text", ["", "frame,time,state,map\n0,0,lost,0\n", "x;y\n1;2\n", "\0\udcff,\n" * 9]
-)
+@pytest.mark.parametrize("text", ["frame,time,state,map\n0,0,lost,0\n", "\0\udcff,\n" * 9])
 def test_files_of_that_name_by_others_and_of_older_versions_say_nothing(text, tmp_path):
     tracked_run(tmp_path, [20 * [FIXED]])
     (tmp_path / "frames.csv").write_bytes(text.encode(errors="surrogateescape"))
@@ -801,31 +631,30 @@ def test_files_of_that_name_by_others_and_of_older_versions_say_nothing(text, tm
 # --- a truth that is measured -------------------------------------------------------------------
 
 
-def measured(truth, sigma, seed=9):
+def measured(truth, sigma):
     """True poses as an instrument sees them, of that σ (m, degrees) along the axes of the body."""
-    n, t = truth.shape[-1] - 1, 6 if truth.shape[-1] == 4 else 3
-    each = np.where(np.arange(t) < n, sigma[0], np.radians(sigma[1]))
-    noise = each * np.random.default_rng(seed).normal(size=(*truth.shape[:2], t))
+    each = np.repeat([sigma[0], np.radians(sigma[1])], 3)
+    noise = each * np.random.default_rng(9).normal(size=(*truth.shape[:2], 6))
     return benchmark.displaced(truth, noise, Convention())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
-@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
-def test_a_right_filter_is_consistent_with_the_sigma_of_a_measured_truth(convention, geometry):
-    sigma, (T, P, truth) = (0.02, 1.5), logged(convention, geometry)
+def test_a_right_filter_is_consistent_with_the_sigma_of_a_measured_truth():
+    sigma, convention = (0.02, 1.5), Convention("left", "body")
+    T, P, truth = logged(convention)
     seen = measured(truth, sigma)
     exact = jaxslam.evaluate_poses(T, P, seen, convention)
     assert exact.verdict["word"] == "over-confident"
     assert exact.asdict()["truth_sigma"] is None
     found = jaxslam.evaluate_poses(T, P, seen, convention, truth_sigma=sigma)
-    assert consistent(found.nees, geometry.tangent_dim)
+    assert consistent(found.nees, 6)
     assert found.asdict()["truth_sigma"] == [0.02, 1.5]
     assert "every stated σ includes that of the truth, 0.02 m and 1.5°" in found.notes
 
 
-@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
-@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
+@pytest.mark.parametrize(
+    ("convention", "geometry"),
+    [(EVERY[0], SPATIAL), (EVERY[11], SPATIAL), (EVERY[21], SPATIAL), (EVERY[11], PLANAR)],
+)
 def test_derivatives_by_true_poses_are_those_of_the_error(convention, geometry):
     """Of errors that are not small: by the truth, and by the pose on which the estimate is laid."""
     t, h = geometry.tangent_dim, 1e-6
@@ -834,19 +663,19 @@ def test_derivatives_by_true_poses_are_those_of_the_error(convention, geometry):
     fixed = Convention(convention.error, axes, convention.order)  # does not turn with the estimate
     J, M = truth_derivatives(fixed, T, truth, first)
 
-    def moved(poses, axis, sign):
-        return benchmark.displaced(poses, sign * h * np.tile(np.eye(t)[axis], (3, 1)), Convention())
+    def moved(poses, axis, step):
+        return benchmark.displaced(poses, step * np.tile(np.eye(t)[axis], (3, 1)), Convention())
+
+    def by_truth(axis, step):
+        return pose_errors(fixed, T, moved(truth, axis, step))
+
+    def by_first(axis, step):
+        return pose_errors(fixed, moved(first, axis, step) @ np.linalg.inv(first) @ T, truth)
 
     for axis in range(t):
-        by_truth, by_first = (
-            [pose_errors(fixed, *arrays(sign)) for sign in (1, -1)]
-            for arrays in (
-                lambda sign: (T, moved(truth, axis, sign)),  # noqa: B023
-                lambda sign: (moved(first, axis, sign) @ np.linalg.inv(first) @ T, truth),  # noqa: B023
-            )
-        )
-        for D, (more, less) in ((J, by_truth), (M, by_first)):
-            np.testing.assert_allclose(D[..., axis], (more - less) / (2 * h), atol=1e-7)
+        for D, error in ((J, by_truth), (M, by_first)):
+            central = (error(axis, h) - error(axis, -h)) / (2 * h)
+            np.testing.assert_allclose(D[..., axis], central, atol=1e-7)
     turned = truth_derivatives(convention, T, truth, first)
     N = change(T, fixed, convention)
     np.testing.assert_allclose(turned[0], N @ J, atol=1e-12)
@@ -854,7 +683,8 @@ def test_derivatives_by_true_poses_are_those_of_the_error(convention, geometry):
 
 @pytest.mark.slow
 def test_the_noise_of_a_first_true_pose_moves_all_and_metres_are_the_truths():
-    """A camera in a unit of its own, 4 m, laid on the first pose of a truth that is measured."""
+    """A camera in a unit of its own, 4 m, laid on the first pose of a truth that is measured; no
+    quick test has both."""
     sigma, (T, P, truth) = (0.08, 1.0), logged(TRACKED, runs=80, steps=12, spread=0.5)
     P = P.copy()
     P[:, 0], truth[:, 0] = 0, T[:, 0]
@@ -869,7 +699,7 @@ def test_the_noise_of_a_first_true_pose_moves_all_and_metres_are_the_truths():
 
 def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     T, P, truth = logged(Convention(), runs=2, steps=3)
-    joint = np.stack([np.kron(np.eye(3), one[0]) for one in P])
+    joint = np.stack([diagonal(one) for one in P])
     poses, firsts, ones = checked_poses(T, joint, truth), truth[:, 0], np.ones(2)
     found = with_truth(poses, Convention(), (0.1, 2.0), ones, firsts)
     assert found.joint is not None
@@ -881,13 +711,3 @@ def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     common = M[:, 1] @ S @ np.swapaxes(M[:, 2], 1, 2)
     np.testing.assert_allclose(blocks[:, 1, :, 2], common, rtol=1e-9, atol=1e-15)
     assert joint[0, 0, 0] == P[0, 0, 0, 0]
-
-
-def test_the_sigma_of_the_truth_is_said_where_it_was_added(tmp_path):
-    found = jaxslam.evaluate_log(one_run(tmp_path / "run"), truth_sigma=(0.05, 1))
-    assert found.asdict()["truth_sigma"] == [0.05, 1.0]
-    assert "includes that of the truth, 0.05 m and 1°" in str(found)
-
-
-def test_a_state_that_is_tested_as_a_whole_may_have_a_million_numbers():
-    assert jaxslam.evaluation.evaluate_nees([[1e6]], 10**6).dof == 10**6

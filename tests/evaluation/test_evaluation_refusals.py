@@ -21,67 +21,53 @@ def changed(values, place, value):
     return values
 
 
-def arrays(e, P, **more):
+def arrays(e=E, P=P, **more):
     return lambda: jaxslam.evaluate(e, P, **more)
 
 
 def spoilt_P(place, value):
-    return arrays(E, changed(P, place, value))
+    return arrays(P=changed(P, place, value))
 
 
 def poses(T=T, P=POSE_P, truth=TRUTH, *more, **how):
     return lambda: jaxslam.evaluate_poses(T, P, truth, *more, **how)
 
 
-def no_time(times):
-    return (arrays(E, P, times=times), "times must be 7 finite, non-decreasing")
-
-
-def all_nan():
-    return jaxslam.evaluate(changed(E, 2, np.nan), changed(P, 2, np.nan))
+def nees(value, dof):
+    return lambda: evaluate_nees([[1.0, value]], dof)
 
 
 KNOWN = changed(P, np.s_[:, 0], 0.0)
-OF_NUMBERS = [
-    (arrays(E[0], P), r"errors must be an array \(runs, steps, n\), .*errors\[None\]"),
-    (arrays(E, P[:, :3]), r"covariances must be \(60, 7, 3, 3\), not \(60, 3, 3, 3\)"),
-    (arrays(E, P[..., 0]), r"covariances must be an array \(runs, steps, n, n\)"),
-    (arrays(changed(E, (4, 2, 1), np.nan), P), "errors of run 4, step 2 holds nan"),
+SET_OUT = changed(changed(E, np.s_[:, 0], 0.0), (3, 0, 1), 0.2)
+OF_ARRAYS = [
+    (arrays(E[0]), r"errors must be an array \(runs, steps, n\), .*errors\[None\]"),
+    (arrays(P=P[:, :3]), r"covariances must be \(60, 7, 3, 3\), not \(60, 3, 3, 3\)"),
+    (arrays(P=P[..., 0]), r"covariances must be an array \(runs, steps, n, n\)"),
+    (arrays(changed(E, (4, 2, 1), np.nan)), "errors of run 4, step 2 holds nan"),
     (spoilt_P((5, 1, 0, 0), np.inf), "covariances of run 5, step 1 holds inf"),
-    (spoilt_P((2, 4, 0, 1), np.nan), "covariances of run 2, step 4 holds nan"),
-    (all_nan, "run 2 is all NaN"),
+    (arrays(changed(E, 2, np.nan), changed(P, 2, np.nan)), "run 2 is all NaN"),
     (spoilt_P((3, 4), -np.eye(3)), "run 3, step 4 has variance -1 at place 0"),
-    (
-        spoilt_P((3, 4, 0, 1), 9.0),
-        r"run 3, step 4 is not symmetric .*it must be symmetric and positive definite",
-    ),
+    (spoilt_P((3, 4, 0, 1), 9.0), r"run 3, step 4 is not symmetric .*it must be symmetric and pos"),
     (spoilt_P((6, 5), 2.0 - np.eye(3)), "run 6, step 5 has an eigenvalue"),
     (spoilt_P((6, 5), 0.0), "run 6, step 5 "),
     (arrays(E[:0], P[:0]), r"errors must be an array .*, not \(0, 7, 3\)"),
-    (arrays("many", P), "errors must be numbers"),
-    (arrays(E.astype(complex), P), "errors must be numbers"),
-    (arrays([[1.0, 2.0], [3.0]], P), "errors must be numbers"),
-    *map(no_time, ([1, 2, 3], np.full(7, np.nan), [0, 1, 2, 3, 2, 5, 6], "soon")),
-    (arrays(E, P, names=["x"]), "names must be 3 different ones"),
-    (arrays(E, P, names=["x", "x", "y"]), "names must be 3 different ones"),
-    (arrays(E, P, quantity="NES"), r"unknown quantity 'NES' .*known: NEES, NIS"),
-    (
-        arrays(changed(changed(E, np.s_[:, 0], 0.0), (3, 0, 1), 0.2), KNOWN),
-        r"run 3, step 0 is zero.* is not: 0\.2.*--align",
-    ),
+    (arrays("many"), "errors must be numbers"),
+    (arrays(E.astype(complex)), "errors must be numbers"),
+    (arrays([[1.0, 2.0], [3.0]]), "errors must be numbers"),
+    (arrays(times=[1, 2, 3]), "times must be 7 finite, non-decreasing"),
+    (arrays(times=[0, 1, 2, 3, 2, 5, 6]), "times must be 7 finite, non-decreasing"),
+    (arrays(times=np.full(7, np.nan)), "times must be 7 finite, non-decreasing"),
+    (arrays(times="soon"), "times must be 7 finite, non-decreasing"),
+    (arrays(names=["x", "x", "y"]), "names must be 3 different ones"),
+    (arrays(quantity="NES"), r"unknown quantity 'NES' .*known: NEES, NIS"),
+    (arrays(SET_OUT, KNOWN), r"run 3, step 0 is zero.* is not: 0\.2.*--align"),
     (arrays(0 * E, 0 * P), "all covariances are zero"),
     (arrays(changed(E, 3, 0.0), changed(P, 3, 0.0)), "all covariances of run 3 are zero"),
-    (lambda: evaluate_nees([[1.0, -1.0]], 3), "NEES of run 0, step 1 is -1; 0 or more"),
-    *[
-        (lambda dof=dof: evaluate_nees([[1.0]], dof), "dof must be one whole number")
-        for dof in (0, -1, 10**6 + 1)
-    ],
-]
-
-OF_POSES = [
+    (nees(-1.0, 3), "NEES of run 0, step 1 is -1; 0 or more"),
+    (nees(1.0, 0), "dof must be one whole number"),
+    (nees(1.0, 10**6 + 1), "dof must be one whole number"),
     (lambda: Convention(error="lfet"), "unknown error 'lfet' .did you mean left"),
     (lambda: Convention(axes="camera"), "unknown axes 'camera'; known: body, world, mixed"),
-    (lambda: Convention(order="xyz"), "unknown order"),
     (lambda: Convention(scale="free"), "unknown scale"),
     (poses(changed(T, (1, 2, 0, 0), 9.0)), "estimates of run 1, step 2 is not a rigid motion"),
     (poses(truth=TRUTH[:2]), r"truths must have the same shape, not \(2, 6, 4, 4\)"),
@@ -91,10 +77,7 @@ OF_POSES = [
         r"truths contain 1e\+300; the limit is 1e\+100",
     ),
     (poses(T[..., :2, :2]), "estimates must be matrices"),
-    (
-        poses(times=np.arange(6) * 100_000_000),
-        r"times 1e.08 from one to the next look like nanoseconds",
-    ),
+    (poses(times=np.arange(6) * 10**8), r"times 1e.08 from one to the next look like nanoseconds"),
     (
         poses(*planar(runs=3)[:3], Convention("split"), axes_used=["x", "yaw"]),
         "unknown axes used 'yaw'; known: x, y, z, rx, ry, rz",
@@ -108,41 +91,42 @@ OF_POSES = [
 ]
 
 
-@pytest.mark.parametrize(("call", "message"), OF_NUMBERS + OF_POSES)
+@pytest.mark.parametrize(("call", "message"), OF_ARRAYS)
 def test_arrays_that_make_no_sense_are_refused_by_run_and_step(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
 
 
+def test_what_is_nearly_singular_or_rounded_or_large_is_no_fault():
+    nearly = changed(P, (6, 5), np.ones((3, 3)) + 1e-3 * np.eye(3) - 5e-3)
+    nearly[..., 0, 1] *= 1 + 1e-7
+    assert jaxslam.evaluate(E, nearly).runs == 60
+    assert evaluate_nees([[1e6]], 10**6).dof == 10**6
+
+
 # --- files: each row writes into a folder, and reads ---------------------------------------------
 
 
-def csv(*rows, text=None):
+def csv(text):
     def read(folder):
-        told = "".join(",".join(map(str, row)) + "\n" for row in rows)
-        (folder / "a.csv").write_text(told if text is None else text)
+        (folder / "a.csv").write_text(text)
         return evaluate_log(folder / "a.csv")
 
     return read
 
 
-def npz(call=evaluate_log, **arrays):
+def npz(arrays, **how):
     def read(folder):
         np.savez(folder / "a.npz", **arrays)
-        return evaluate_log(folder / "a.npz")
+        return evaluate_log(folder / "a.npz", **how)
 
     return read
 
 
 def of_errors(**how):
     """A whole file of errors, evaluated as what it is not."""
-
-    def read(folder):
-        np.savez(folder / "a.npz", errors=E, covariances=P)
-        return evaluate_log(folder / "a.npz", **how)
-
-    return read
+    return npz({"errors": E, "covariances": P}, **how)
 
 
 def covariances(text):
@@ -153,9 +137,12 @@ def covariances(text):
     return read
 
 
-def pose_alone(folder, **how):
-    write_tum(folder / "estimate.txt", [0.0], np.eye(4)[None])
-    return evaluate_log(folder / "estimate.txt", **how)
+def pose_alone(**how):
+    def read(folder):
+        write_tum(folder / "estimate.txt", [0.0], np.eye(4)[None])
+        return evaluate_log(folder / "estimate.txt", **how)
+
+    return read
 
 
 def plane_and_space(folder):
@@ -165,63 +152,54 @@ def plane_and_space(folder):
     return evaluate_log(folder)
 
 
-DEVIATIONS = "1 1 -0.1 1 1 1"
-UPPER = "1 " * 22
-SIX_STEPS = [(r, 9 * r + s, 1, 1) for r in range(3) for s in (0, 1)]
+def with_truth_sigma(*sigma):
+    return lambda folder: evaluate_log(one_run(folder), truth_sigma=sigma)
+
+
+ONE, UPPER, DEVIATIONS = np.ones((1, 1, 1)), "1 " * 22, "0 1 1 -0.1 1 1 1"
+NEES = "run,step,nees,dof\n0,0,1,3\n"
+POSES = {"estimates": T, "covariances": POSE_P, "truths": TRUTH}
 OF_FILES = [
-    (csv((0, 0, 1.0, 1.0), (0, 1, 1.0)), "line 2: expected numbers run, step, n errors"),
-    (csv((0, 0, 1.0, 1.0, 3.0)), "5 columns; expected numbers run, step"),
-    (csv((0, 0, 1.0, 1.0, 3.0)), "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"),
-    (csv((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 appears twice"),
-    (csv(*SIX_STEPS), "6 different"),
-    (csv((0, 0, "nan", 1.0)), "run 0 is all NaN"),
-    (csv((0, 0, 1.0, 2.0, 1.0, "nan", 1.0)), "line 1: expected numbers run"),
-    (csv((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
-    (csv((1, 1, 1, 1), (1, 2, 1, 1), (3, 2, 1, -1)), "run 3, step 2 has variance"),
-    (csv(text="run,step,e,P\n"), "has no errors"),
-    (csv(text="run,step,nees,dof\n0,0,1,3\n0,1,1,4.5\n"), "dof must be one whole number from 1"),
-    (csv(text="run,step,nees,dof\n0,0,1,3\n0,1,1,nan\n"), "line 3: expected numbers run, step"),
-    (npz(errors=np.ones((1, 1, 1))), "errors and covariances"),
-    (npz(eror=np.ones((1, 1, 1))), r"unknown array 'eror' \(did you mean error\?\)"),
-    (npz(errors=np.array([None])), "not an npz file of numbers"),
-    (npz(errors=np.ones((1, 1, 1)), covariances=np.array("many")), "must be numbers"),
-    (npz(errors=1, innovations=1, covariances=1), "contains errors, innovations"),
-    (npz(estimates=np.ones((1, 1, 4, 4)), covariances=1.0), "covariances and truths"),
-    (
-        npz(errors=np.ones((1, 1, 1)), sigmas=-1.22 * np.ones((1, 1, 1))),
-        r"sigmas of run 0, step 0 must not be negative, not -1\.22",
-    ),
+    (csv("0,0,1,1\n0,1,1\n"), "line 2: expected numbers run, step, n errors"),
+    (csv("0,0,1,1,3\n"), "5 columns; expected numbers run, step.*4 for n = 1, 7 for 2, 11 for 3"),
+    (csv("0,0,1,1\n0,0,2,1\n"), "line 2: run 0, step 0 appears twice"),
+    (csv("0,0,1,1\n0,1,1,1\n1,9,1,1\n1,10,1,1\n2,18,1,1\n2,19,1,1\n"), "6 different"),
+    (csv("0,0,nan,1\n"), "run 0 is all NaN"),
+    (csv("0,0,1,2,1,nan,1\n"), "line 1: expected numbers run"),
+    (csv("1,1,1,1\n1,2,1,1\n3,2,1,-1\n"), "run 3, step 2 has variance"),
+    (csv("run,step,e,P\n"), "has no errors"),
+    (csv(NEES + "0,1,1,4.5\n"), "dof must be one whole number from 1"),
+    (csv(NEES + "0,1,1,nan\n"), "line 3: expected numbers run, step"),
+    (npz({"errors": ONE}), "errors and covariances"),
+    (npz({"errors": np.array([None])}), "not an npz file of numbers"),
+    (npz({"eror": ONE}), r"unknown array 'eror' \(did you mean error\?\)"),
+    (npz({"errors": ONE, "covariances": np.array("many")}), "must be numbers"),
+    (npz({"errors": 1, "innovations": 1, "covariances": 1}), "contains errors, innovations"),
+    (npz({"estimates": np.ones((1, 1, 4, 4)), "covariances": 1.0}), "covariances and truths"),
+    (npz(POSES | {"error": []}), "unknown error ''; known: right, left, split"),
+    (npz({"errors": ONE, "sigmas": -1.22 * ONE}), r"sigmas of run 0, step 0 must not .* -1\.22"),
     (of_errors(stated={"error": "left"}), "axes used and σ of the truth apply to poses"),
     (of_errors(axes_used="x"), "axes used and σ of the truth apply to poses"),
     (of_errors(truth_sigma=(1, 1)), "σ of the truth apply to poses"),
     (of_errors(truth="t.txt"), "--truth goes with a trajectory"),
     (of_errors(nis=True, innovations="a.npz"), "--innovations FILE, not both"),
-    (pose_alone, r"needs a truth file .* one of covariances \(--covariance FILE\)"),
-    (lambda x: pose_alone(x, nis=True), "innovations must be in an npz or CSV file"),
+    (pose_alone(), r"needs a truth file .* one of covariances \(--covariance FILE\)"),
+    (pose_alone(nis=True), "innovations must be in an npz or CSV file"),
     (plane_and_space, r"truth\.txt: estimate and truth must both be planar"),
     (lambda x: evaluate_log(x / "missing.npz"), "no such file or folder"),
     (evaluate_log, r"has neither estimate\.txt nor sub-folders"),
-    *[
-        (lambda x, wrong=wrong: evaluate_log(one_run(x), truth_sigma=wrong), "truth_sigma must be")
-        for wrong in ((-1, 0), (1,), (np.nan, 1), (1, 2, 3))
-    ],
+    (with_truth_sigma(-1, 0), "truth_sigma must be"),
+    (with_truth_sigma(1), "truth_sigma must be"),
+    (with_truth_sigma(np.nan, 1), "truth_sigma must be"),
     (covariances("0 1 2 3\n"), r"c\.txt, line 1: expected 22 finite numbers"),
     (covariances("# a\n" + "nan " * 22), r"c\.txt, line 2: expected 22 finite numbers"),
     (covariances("# error=lfet\n" + UPPER), r"c\.txt: unknown error 'lfet' \(did you mean left\?"),
-    (
-        covariances("# eror=left\n" + UPPER),
-        r"c\.txt: unknown key 'eror' in the header \(did you mean error\?\)",
-    ),
+    (covariances("# eror=left\n" + UPPER), r"c\.txt: unknown key 'eror' in the header \(did you"),
     (covariances("# angle=grad\n" + UPPER), r"c\.txt: unknown angle 'grad'"),
     (covariances("#\n"), r"c\.txt has no covariances"),
-    (covariances(f"0 {DEVIATIONS}\n"), r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+"),
-    (
-        covariances(f"0 {DEVIATIONS}" + " 0" * 11 + "\n"),
-        r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+",
-    ),
+    (covariances(f"{DEVIATIONS}\n"), r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+"),
+    (covariances(f"{DEVIATIONS}{' 0' * 11}\n"), r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+"),
 ]
-
-STAMPS, LEFT = np.arange(6) / 10, Convention("left")
 
 
 def two_runs(spoil):
@@ -238,42 +216,33 @@ def another(place):
     return two_runs(lambda x: (x / place).write_text((x / "run01" / "estimate.txt").read_text()))
 
 
-def stated(P, convention=LEFT):
+def without(place):
+    return two_runs(lambda x: (x / place).unlink())
+
+
+def stated(P, convention):
     def spoil(folder):
-        P_each = np.tile(P, (6, 1, 1))
-        write_covariances(folder / "run01" / "covariance.txt", STAMPS, P_each, convention)
+        P_each, path = np.tile(P, (6, 1, 1)), folder / "run01" / "covariance.txt"
+        write_covariances(path, np.arange(6) / 10, P_each, convention)
 
     return two_runs(spoil)
 
 
-def times(**given):
-    return lambda folder: evaluate_log(one_run(folder / "run", **given))
-
-
 def shown(of, *names):
-    return times(shown=dict.fromkeys(names or ("estimate.txt", "covariance.txt", "truth.txt"), of))
-
-
-def nanoseconds(t):
-    return f"{round(t * 1e9)}"
+    """A run with other times in these of its files."""
+    names = names or ("estimate.txt", "covariance.txt", "truth.txt")
+    return lambda folder: evaluate_log(one_run(folder / "run", shown=dict.fromkeys(names, of)))
 
 
 def of_text(name, text):
-    """A run of which one file is another."""
+    """A run of which one file is another, or what is made of it."""
 
     def read(folder):
-        run = one_run(folder / "run")
-        (run / name).write_text(text)
-        return evaluate_log(run)
+        file = one_run(folder / "run") / name
+        file.write_text(text(file.read_text()) if callable(text) else text)
+        return evaluate_log(folder / "run")
 
     return read
-
-
-def a_part(folder):
-    run = one_run(folder)
-    lines = (run / "truth.txt").read_text().splitlines()
-    (run / "truth.txt").write_text("\n".join(lines[:16]))
-    return evaluate_log(run)
 
 
 def frames(old, new):
@@ -292,25 +261,25 @@ OF_FOLDERS = [
     (another("run00/trajectory.txt"), r"run00 has both estimate\.txt and trajectory\.txt; keep"),
     (another("run00/groundtruth.txt"), r"run00 has both truth\.txt and groundtruth\.txt; keep one"),
     (another("estimate.txt"), r"has a run and sub-folders with runs \(run00, run01\)"),
-    (two_runs(lambda x: (x / "run01/truth.txt").unlink()), r"run01 has no truth\.txt"),
-    (two_runs(lambda x: (x / "run00/estimate.txt").unlink()), r"run00 has no estimate\.txt"),
+    (without("run01/truth.txt"), r"run01 has no truth\.txt"),
+    (without("run00/estimate.txt"), r"run00 has no estimate\.txt"),
     (
         two_runs(lambda x: write_tum(x / "run01/truth.txt", [99.0], np.eye(4)[None])),
         r"no time stamps in common within 0\.01 s",
     ),
-    (stated(np.eye(6)), "states a different convention"),
+    (stated(np.eye(6), Convention("left")), "states a different convention"),
     (stated(-np.eye(6), Convention()), ": the covariance of run01, step 0 has variance -1"),
-    (times(offset=0.05), r"truth\.txt have no time stamps in common"),
+    (
+        lambda x: evaluate_log(one_run(x / "run", offset=0.05)),
+        r"truth\.txt have no time stamps in common within 0\.01 s",
+    ),
     (
         shown(lambda t: f"{(t - 1.4e9) * 1e5:.0f}"),  # a hundred a second, in microseconds
         r"times 1e.04 from one to the next look like microseconds or milliseconds; expected "
         "seconds; a title such as t_us says which",
     ),
     (shown(lambda t: f"{t * 1e8:.0f}"), r"1\.4e.17 look like nanoseconds; expected seconds"),
-    (
-        shown(lambda t: f"{t:g}"),
-        "its 40 poses have only 1 different times, perhaps printed with too few digits",
-    ),
+    (shown(lambda t: f"{t:g}"), "have only 1 different times, perhaps printed with too few digits"),
     (
         shown(lambda t: f"{t + (t > 1.4e9 + 0.7) * 0.03:.9f}", "truth.txt"),
         r"of its 40 times .* only 8 can be compared: 40 have a covariance .* 8 a truth\. "
@@ -328,14 +297,8 @@ OF_FOLDERS = [
         of_text("estimate.txt", "#%FORMAT SQUARE/0.3\n#%TIMESTAMP_UNIT weeks\n" + "1 " * 29),
         r"the header TIMESTAMP_UNIT is weeks; expected seconds or milliseconds or",
     ),
-    (
-        of_text("estimate.txt", "0 1 2 3 4 5\n"),
-        r"estimate\.txt, line 1: 6 columns are no known format; expected eight finite numbers",
-    ),
-    (
-        of_text("truth.txt", "a,t,b\n0,1,2\n"),
-        r"truth\.txt, line 2: 3 columns \(a, t, b\) are no known format",
-    ),
+    (of_text("estimate.txt", "0 1 2 3 4 5\n"), r"line 1: 6 columns are no known format; expected"),
+    (of_text("truth.txt", "a,t,b\n0,1,2\n"), r"line 2: 3 columns \(a, t, b\) are no known format"),
     (
         of_text("truth.txt", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"),
         r"has 40 poses and .*truth\.txt 1, and not both have stamps: .*give times",
@@ -344,7 +307,10 @@ OF_FOLDERS = [
         shown(lambda t: f"{1.4e9 + 10 * (t - 1.4e9) + 0.03:.9f}", "truth.txt"),
         r"known to \d+ of its σ only; log it at the stamps of the truth",
     ),
-    (a_part, r"only 15 can be compared.* half the lines"),
+    (
+        of_text("truth.txt", lambda text: "\n".join(text.splitlines()[:16])),
+        r"only 15 can be compared.* half the lines",
+    ),
     (frames(",1,,", ",yes,,"), r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
     (frames("9,0.3", "9,nan0.3"), r"frames\.csv, line 11: expected a finite time"),
     (frames(",1,,", ",0,,"), "every frame with a pose is lost or has no fixed unit"),
@@ -375,11 +341,3 @@ def test_a_mistake_ends_the_command_with_status_2_and_one_line(tmp_path, capsys)
         assert (stop.value.code, error.count("\n")) == (2, 1)
         assert message in error
     assert not (tmp_path / "out").exists()
-
-
-def test_what_is_nearly_singular_or_rounded_is_no_fault():
-    nearly = changed(P, (6, 5), np.ones((3, 3)) + 1e-3 * np.eye(3) - 5e-3)
-    assert jaxslam.evaluate(E, nearly).runs == 60
-    rounded = P.copy()
-    rounded[..., 0, 1] *= 1 + 1e-7
-    jaxslam.evaluate(E, rounded)

@@ -32,7 +32,7 @@ def moving(tilt=0.4):
     return T, T @ rigid(noise[:, 3:], noise[:, :3])
 
 
-@pytest.mark.parametrize("align", ["none", "se3", "yaw"])
+@pytest.mark.parametrize("align", ["none", "se3"])
 def test_both_are_found_and_without_them_the_filter_is_right(align):
     T, truth = moving()
     world = rigid(

@@ -6,87 +6,53 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxslam.io.calibration import (
-    Calibration,
-    from_field_of_view,
-    write_calibration,
-)
+from jaxslam.io.calibration import Calibration, from_field_of_view, write_calibration
 from jaxslam.io.lens_files import read_calibration
 
-GOOD = {
-    "model": "pinhole",
-    "width": 640,
-    "height": 480,
-    "fx": 525.0,
-    "fy": 524.0,
-    "cx": 308.5,
-    "cy": 236.5,
-    "distortion": [0.1, -0.2],
-}
-
-
+PINHOLE = {"model": "pinhole", "width": 640, "height": 480}
+GOOD = PINHOLE | {"fx": 525.0, "fy": 524.0, "cx": 308.5, "cy": 236.5, "distortion": [0.1, -0.2]}
 SIGMAS = dict.fromkeys(("fx", "fy", "cx", "cy"), 1.0)
+PLAIN = Calibration(640, 480, 525.06, 524.2, 308.6, 236.5)
 
 
-def write(path, **changes):
-    fields = {**GOOD, **changes}
-    path.write_text(json.dumps({key: value for key, value in fields.items() if value is not None}))
-    return path
-
-
-def test_written_calibration_is_read_back(tmp_path):
-    calibration = Calibration(640, 480, 525.06, 524.2, 308.6, 236.5, (0.1, -0.2, 1e-4, 2e-4, 0.3))
-    write_calibration(tmp_path / "calibration.json", calibration)
-    assert read_calibration(tmp_path / "calibration.json") == calibration
-    assert [file.name for file in tmp_path.iterdir()] == ["calibration.json"]
-
-
-def test_standard_deviations_are_written_and_read_back(tmp_path):
-    path = tmp_path / "calibration.json"
-    calibration = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, sigma=(1.5, 1.6, 0.7, 0.8))
-    write_calibration(path, calibration, sigma={"distortion": [0.1] * 5}, views=12)
+@pytest.mark.parametrize(
+    "calibration",
+    [
+        PLAIN,
+        replace(PLAIN, distortion=(0.1, -0.2, 1e-4, 2e-4, 0.3), sigma=(1.5, 1.6, 0.7, 0.8)),
+        from_field_of_view(640, 480),
+    ],
+    ids=["plain", "with σ", "guessed"],
+)
+def test_a_calibration_is_read_back_and_what_was_not_stated_is_not_written(calibration, tmp_path):
+    path = tmp_path / "c.json"
+    write_calibration(path, calibration)
     assert read_calibration(path) == calibration
-    written = json.loads(path.read_text())
-    assert written["sigma"] == {
-        "fx": 1.5, "fy": 1.6, "cx": 0.7, "cy": 0.8, "distortion": [0.1] * 5
-    }  # fmt: skip
-    assert written["views"] == 12
+    assert list(tmp_path.iterdir()) == [path]
+    assert calibration is not PLAIN or json.loads(path.read_text()).keys() == GOOD.keys()
+    if any(calibration.sigma):  # with what is known besides
+        write_calibration(path, calibration, sigma={"distortion": [0.1] * 5}, views=12)
+        assert read_calibration(path) == calibration
+        written = json.loads(path.read_text())
+        assert (written["sigma"]["fx"], written["views"]) == (calibration.sigma[0], 12)
+        assert written["sigma"]["distortion"] == [0.1] * 5
 
 
-def test_what_nobody_stated_is_not_written(tmp_path):
-    write_calibration(tmp_path / "c.json", Calibration(640, 480, 525.0, 524.0, 308.5, 236.5))
-    assert json.loads((tmp_path / "c.json").read_text()).keys() == {
-        "model", "width", "height", "fx", "fy", "cx", "cy", "distortion"
-    }  # fmt: skip
-
-
-def test_a_guess_stays_a_guess_in_a_file(tmp_path):
-    write_calibration(tmp_path / "c.json", from_field_of_view(640, 480))
-    assert read_calibration(tmp_path / "c.json") == from_field_of_view(640, 480)
-
-
-@pytest.mark.parametrize("width", [640, 1000])
-def test_a_field_of_view_reaches_from_edge_to_edge(width):
-    calibration = from_field_of_view(width, 480, 80.0)
+def test_a_field_of_view_reaches_from_edge_to_edge():
+    calibration = from_field_of_view(640, 480, 80.0)
     assert calibration.guessed
-    across = np.degrees(np.arctan(width / 2 / calibration.fx)) * 2
+    across = np.degrees(np.arctan(320 / calibration.fx)) * 2
     assert across == pytest.approx(80.0, rel=1e-12)
     assert calibration.fx == calibration.fy
-    assert (calibration.cx, calibration.cy) == ((width - 1) / 2, 239.5)
+    assert (calibration.cx, calibration.cy) == (319.5, 239.5)
     assert calibration.sigma[:2] == (0.05 * calibration.fx,) * 2
-
-
-def test_a_guess_is_of_the_longer_side_and_less_sure():
+    # A guess is of the longer side, and less sure.
     wide, tall = from_field_of_view(640, 480), from_field_of_view(480, 640)
     assert wide.fx == tall.fx == pytest.approx(320 / np.tan(np.radians(65 / 2)), rel=1e-12)
-    assert wide.sigma[0] == pytest.approx(0.15 * wide.fx, rel=1e-12)
-    assert wide.sigma[2] == pytest.approx(0.02 * 640, rel=1e-12)
-
-
-@pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan")])
-def test_a_field_of_view_that_no_pinhole_has_is_refused(degrees):
-    with pytest.raises(ValueError, match="between 0° and 180°"):
-        from_field_of_view(640, 480, degrees)
+    assert wide.sigma[::2] == pytest.approx((0.15 * wide.fx, 0.02 * 640), rel=1e-12)
+    for degrees in (0.0, 180.0, float("nan")):
+        with pytest.raises(ValueError, match="between 0° and 180°"):
+            from_field_of_view(640, 480, degrees)
 
 
 def test_resized_keeps_directions_and_the_share_of_every_error():
@@ -101,63 +67,12 @@ def test_resized_keeps_directions_and_the_share_of_every_error():
     assert new.distortion == old.distortion
 
 
-def test_matrix_projects_as_a_pinhole(tmp_path):
-    calibration = read_calibration(write(tmp_path / "c.json"))
+def test_the_matrix_projects_as_a_pinhole_and_distortion_is_padded(tmp_path):
+    (tmp_path / "c.json").write_text(json.dumps(GOOD))
+    calibration = read_calibration(tmp_path / "c.json")
     u, v, w = calibration.matrix @ np.array([0.4, -0.2, 2.0])
     assert (u / w, v / w) == pytest.approx((525.0 * 0.2 + 308.5, 524.0 * -0.1 + 236.5))
-
-
-@pytest.mark.parametrize("given", [[], [0.1], [0.1, -0.2, 0.01, 0.02]])
-def test_short_distortion_is_padded(tmp_path, given):
-    calibration = read_calibration(write(tmp_path / "c.json", distortion=given))
-    assert calibration.distortion == tuple(given) + (0.0,) * (5 - len(given))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"fx": None, "cy": None}, "missing fx, cy"),
-        ({"model": "omni"}, "unknown camera model 'omni'; expected pinhole, rational, fisheye"),
-        ({"model": "fisheye", "distortion": [0.0] * 5}, "has 5 entries; expected at most k1, k2"),
-        ({"fx": -525.0}, "fx must be positive, not -525.0"),
-        ({"fy": float("nan")}, "fy must be finite, not nan"),
-        ({"cx": float("inf")}, "cx must be finite, not inf"),
-        ({"width": 0}, "width must be positive, not 0"),
-        ({"width": 640.5}, "width must be a whole number of pixels, not 640.5"),
-        ({"fx": "525"}, "fx must be a number, not '525'"),
-        ({"height": True}, "height must be a number, not True"),
-        ({"distortion": [0.0] * 6}, "has 6 entries"),
-        ({"distortion": 0.1}, "distortion must be a list"),
-        ({"distortion": [0.1, "x"]}, r"distortion\[1\] must be a number, not 'x'"),
-        ({"sigma": {"fx": 1.0}}, "an object with fx, fy, cx, cy"),
-        ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "an object with fx, fy, cx, cy"),
-        ({"sigma": SIGMAS | {"fx": -1.0}}, "sigma of fx must not be negative, not -1.0"),
-        ({"sigma": SIGMAS | {"fx": "1"}}, "sigma of fx must be a number, not '1'"),
-    ],
-)
-@pytest.mark.usefixtures("unchecked")
-def test_bad_fields_are_refused_naming_file_and_field(tmp_path, changes, words):
-    path = write(tmp_path / "bad.json", **changes)
-    with pytest.raises(ValueError, match=words) as caught:
-        read_calibration(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("{", "not a JSON file"),
-        ("[1]", "expected a JSON object, not a list"),
-        (None, "cannot read"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, text, words):
-    path = tmp_path / "c.json"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(ValueError, match=words):
-        read_calibration(path)
+    assert calibration.distortion == (0.1, -0.2, 0, 0, 0)
 
 
 LENS = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, (0.1, -0.2, 0.01, 0.02))
@@ -216,20 +131,19 @@ Camera.height: 480
 }
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_the_files_of_other_programs_are_read(tmp_path, name):
-    (tmp_path / name).write_text(OTHERS[name])
-    assert read_calibration(tmp_path / name) == LENS
-
-
 FISHEYE = replace(LENS, distortion=(0.1, -0.2, 0.01, 0.02), model="fisheye")
 RATIONAL = replace(LENS, distortion=(0.1, -0.2, 0.01, 0.02, 0.0, 0.0, 0.0, 0.3), model="rational")
 EIGHT = "0.02, 0, 0, 0, 0.3]"
+FOUR = replace(LENS, fy=525.0, distortion=(0.1, -0.2))
+
+
+COLMAP = "OPENCV 640 480 525 524 309.0 237.0 0.1 -0.2 0.01 0.02"
 
 
 @pytest.mark.parametrize(
     ("name", "old", "new", "lens"),
     [
+        *[(name, "", "", LENS) for name in OTHERS],
         ("camchain.yaml", "radtan", "equidistant", FISHEYE),
         ("camchain.yaml", "model: pinhole", "model: pinhole-equi", FISHEYE),
         ("ros.yaml", "plumb_bob", "kannala_brandt", FISHEYE),
@@ -239,11 +153,25 @@ EIGHT = "0.02, 0, 0, 0, 0.3]"
         ("ros.yaml", "0.02, 0]", EIGHT, RATIONAL),
         ("opencv.yaml", "0.02, 0. ]", EIGHT, RATIONAL),
         ("cameras.txt", "OPENCV", "FULL_OPENCV", RATIONAL),
+        *[
+            ("cameras.txt", COLMAP, f"{model} 640 480 {values}", lens)
+            for model, values, lens in (
+                ("SIMPLE_PINHOLE", "525 309 237", replace(LENS, fy=525.0, distortion=())),
+                ("PINHOLE", "525 524 309 237", replace(LENS, distortion=())),
+                ("SIMPLE_RADIAL", "525 309 237 0.1", replace(LENS, fy=525.0, distortion=(0.1,))),
+                ("RADIAL", "525 309 237 .1 -.2", FOUR),
+                (
+                    "RADIAL_FISHEYE",
+                    "525 309 237 .1 -.2",
+                    replace(FISHEYE, fy=525.0, distortion=FOUR.distortion[:2]),
+                ),
+            )
+        ],
     ],
 )
-def test_wide_lenses_of_other_programs_are_read(tmp_path, name, old, new, lens):
-    text = OTHERS[name].replace(old, new)
-    if name == "orb.yaml":
+def test_the_lenses_of_other_programs_are_read(tmp_path, name, old, new, lens):
+    text = OTHERS[name].replace(old, new) if old else OTHERS[name]
+    if lens == FISHEYE and name == "orb.yaml":
         text = text.replace("p1", "k3").replace("p2", "k4")
     if lens is RATIONAL:
         text = text.replace("plumb_bob", "rational_polynomial")
@@ -254,34 +182,47 @@ def test_wide_lenses_of_other_programs_are_read(tmp_path, name, old, new, lens):
     assert read_calibration(tmp_path / "own.json") == lens
 
 
-@pytest.mark.parametrize(
-    ("model", "values", "lens"),
-    [
-        ("SIMPLE_PINHOLE", "525 309 237", replace(LENS, fy=525.0, distortion=())),
-        ("PINHOLE", "525 524 309 237", replace(LENS, distortion=())),
-        ("SIMPLE_RADIAL", "525 309 237 0.1", replace(LENS, fy=525.0, distortion=(0.1,))),
-        ("RADIAL", "525 309 237 0.1 -0.2", replace(LENS, fy=525.0, distortion=(0.1, -0.2))),
-        (
-            "RADIAL_FISHEYE", "525 309 237 0.1 -0.2",
-            replace(FISHEYE, fy=525.0, distortion=(0.1, -0.2)),
-        ),
-    ],
-)  # fmt: skip
-def test_colmaps_cameras_are_read(tmp_path, model, values, lens):
-    (tmp_path / "cameras.txt").write_text(f"1 {model} 640 480 {values}\n")
-    assert read_calibration(tmp_path / "cameras.txt") == lens
+def own(**changes):
+    fields = {key: value for key, value in (GOOD | changes).items() if value is not None}
+    return "own.json", json.dumps(fields)
+
+
+def other(name, old, new):
+    return name, OTHERS[name].replace(old, new)
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "words"),
+    ("file", "words"),
     [
-        ("camchain.yaml", "pinhole", "omni", "unknown lens, omni radtan of 4 numbers; expected"),
-        ("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0, 0.3]", "of 9 numbers; expected plumb_bob"),
-        ("ros.yaml", "image_width: 640\n", "", "has no image size or no camera matrix; its keys"),
-        ("cameras.txt", "OPENCV", "FOV", "unknown camera model FOV of 10"),
+        (own(fx=None, cy=None), "missing fx, cy"),
+        (own(model="omni"), "unknown camera model 'omni'; expected pinhole, rational, fisheye"),
+        (own(model="fisheye", distortion=[0.0] * 5), "has 5 entries; expected at most k1, k2"),
+        (own(fx=-525.0), "fx must be positive, not -525.0"),
+        (own(fy=float("nan")), "fy must be finite, not nan"),
+        (own(width=0), "width must be positive, not 0"),
+        (own(width=640.5), "width must be a whole number of pixels, not 640.5"),
+        (own(fx="525"), "fx must be a number, not '525'"),
+        (own(height=True), "height must be a number, not True"),
+        (own(distortion=0.1), "distortion must be a list"),
+        (own(distortion=[0.1, "x"]), r"distortion\[1\] must be a number, not 'x'"),
+        (own(sigma=[1.0, 1.0, 1.0, 1.0]), "an object with fx, fy, cx, cy"),
+        (own(sigma=SIGMAS | {"fx": -1.0}), "sigma of fx must not be negative, not -1.0"),
+        (own(sigma=SIGMAS | {"fx": "1"}), "sigma of fx must be a number, not '1'"),
+        (("own.json", "{"), "not a JSON file"),
+        (("own.json", "[1]"), "expected a JSON object, not a list"),
+        (("own.json", None), "cannot read"),
+        (other("camchain.yaml", "pinhole", "omni"), "unknown lens, omni radtan of 4 numbers; exp"),
+        (other("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0, 0.3]"), "of 9 numbers; expected plumb"),
+        (other("ros.yaml", "image_width: 640\n", ""), "has no image size or no camera matrix; i"),
+        (other("cameras.txt", "OPENCV", "FOV"), "unknown camera model FOV of 10"),
     ],
 )
-def test_another_lens_of_another_program_is_refused(tmp_path, name, old, new, words):
-    (tmp_path / name).write_text(OTHERS[name].replace(old, new))
-    with pytest.raises(ValueError, match=words):
-        read_calibration(tmp_path / name)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_calibration_is_refused_naming_file_and_field(file, words, tmp_path):
+    path, text = tmp_path / file[0], file[1]
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=words) as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -100,23 +100,16 @@ def test_the_files_of_every_program_are_one_calibration(name, tmp_path):
         ("gyroscope_noise_density: 1.6968e-04\n", "", "gyroscope_noise_density is missing; expec"),
         ("1.9393e-05", "many", "gyroscope_random_walk is missing; expected a .* in rad/s²/√Hz"),
         ("2.0e-3", "0.0", "accelerometer_noise_density is 0; expected a positive density in m"),
-        ("3.0e-03", "-3.0e-03", "accelerometer_random_walk is -0.003; expected"),
         ("1.6968e-04", "0.2", r"gyroscope_noise_density is 0\.2; .* up to 0\.1 .*reading by √rate"),
         ("T_cam_imu", "T_cn_cnm1", "the pose of the camera is missing; expected T_cam_imu of Kal"),
-        (words(T_CI[0], ", "), words(1.1 * T_CI[0], ", "), "T_cam_imu is no pose; expected"),
         (words(T_CI[0], ", "), words(-T_CI[0], ", "), "T_cam_imu is no pose; expected"),
-        (
-            words(T_CI[0], ", "),
-            words([*T_CI[0, :3], 65.0], ", "),
-            "T_cam_imu is no pose; .* up to 10 m",
-        ),
+        (words(T_CI[0], ", "), words([*T_CI[0, :3], 65.0], ", "), "T_cam_imu is no .* up to 10 m"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 0.0]", "T_cam_imu is no pose; expected"),
     ],
 )
 def test_what_is_missing_or_implausible_is_named(old, new, message, tmp_path):
-    paths = write(
-        tmp_path, {name: text.replace(old, new) for name, text in FILES["Kalibr"].items()}
-    )
+    spoilt = {name: text.replace(old, new) for name, text in FILES["Kalibr"].items()}
+    paths = write(tmp_path, spoilt)
     with pytest.raises(ValueError, match=message) as caught:
         read_inertial_calibration(*paths)
     assert str(paths[0]) in str(caught.value)
@@ -165,14 +158,11 @@ def test_densities_are_compared_with_a_log_at_its_calmest(factor, told, tmp_path
     rates = moved + found.gyroscope_noise_density * 200**0.5 * draw.normal(size=(4000, 3))
     forces = moved + found.accelerometer_noise_density * 200**0.5 * draw.normal(size=(4000, 3))
     log = InertialLog(times, rates, forces, "mine")
-    notes = found._replace(gyroscope_noise_density=factor * found.gyroscope_noise_density).compared(
-        log
-    )
+    stated = found._replace(gyroscope_noise_density=factor * found.gyroscope_noise_density)
+    notes = stated.compared(log)
     assert len(notes) == (told is not None)
-    if told:
-        (note,) = notes
+    for note in notes:
         assert note.startswith("gyroscope_noise_density is ")
-        np.testing.assert_allclose(
-            float(note.split("scatter as of ")[1].split(";")[0]), 1.6968e-4, rtol=0.1
-        )
+        seen = float(note.split("scatter as of ")[1].split(";")[0])
+        assert seen == pytest.approx(1.6968e-4, rel=0.1)
         assert re.search(told, note)

@@ -56,14 +56,9 @@ def empty(folder):
 
 YAML = "mav0/cam0/sensor.yaml"
 REFUSED = [
-    (
-        euroc,
-        instead(YAML, "radial-tangential", "fov"),
-        r"yaml: unknown lens, pinhole fov of",
-    ),
+    (euroc, instead(YAML, "radial-tangential", "fov"), r"yaml: unknown lens, pinhole fov of"),
     (euroc, instead(YAML, "61.5, ", ""), r"sensor\.yaml: has no image size or no camera matrix"),
     (euroc, instead(YAML, "60.5", "nan"), r"sensor\.yaml: fx must be finite, not nan"),
-    (euroc, instead(YAML, "60.5", "-60.5"), r"sensor\.yaml: fx must be positive, not -60\.5"),
     (euroc, without_a_picture, r"data\.csv names \d+\.png, but .* is missing"),
     (kitti, put("times.txt", "0\n0.1\n"), r"times\.txt has 2 lines for 3 images"),
     (kitti, put("times.txt", "0\n0.1\n0.1\n"), r"times\.txt, line 3: time 0\.1 s does not come"),
@@ -71,20 +66,10 @@ REFUSED = [
     (kitti, put("calib.txt", "P1: 1 2 3\n"), r"calib\.txt has no line P0:"),
     (kitti, put("calib.txt", "P0: 1 2 3\n"), r"calib\.txt, line 1: expected P0: and twelve numb"),
     (kitti, put("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n"), r"poses\.txt, line 1: expected 12 finite"),
-    (
-        kitti,
-        put("poses.txt", words(np.eye(4)[:3]) + "\n"),
-        r"poses\.txt has 1 lines for 3 images",
-    ),
-    (
-        seven_scenes,
-        put("frame-000003.pose.txt", "1 0 0 0\n"),
-        r"frame-000003\.pose\.txt has 1 rows; expected a 4x4",
-    ),
+    (kitti, put("poses.txt", words(np.eye(4)[:3])), r"poses\.txt has 1 lines for 3 images"),
+    (seven_scenes, put("frame-000003.pose.txt", "1 0 0 0\n"), r"0003\.pose\.txt has 1 rows; expec"),
     (timestamped, listed("0.5 0.png", "0.5 1.png"), r"s\.txt, line 2: time 0\.5 s does not come a"),
-    (timestamped, listed("# x", "0.5 0.png", "0.4 1.png"), r"timestamps\.txt, line 3: time"),
     (timestamped, listed("nan 0.png"), r"timestamps\.txt, line 1: .*finite"),
-    (timestamped, listed("zero 0.png"), r"timestamps\.txt, line 1: .*finite"),
     (timestamped, listed("0.5"), r"timestamps\.txt, line 1: "),
     (timestamped, listed("0.5 9.jpg"), r"timestamps\.txt names 9\.jpg, but .* is missing"),
     (timestamped, listed("# empty"), r"timestamps\.txt has no lines"),
@@ -97,15 +82,14 @@ REFUSED = [
 
 
 def test_tum_vi_has_the_fisheye_of_its_camchain(tmp_path):
-    path = euroc(tmp_path)
+    path, four = euroc(tmp_path), (0.003, 0.0007, -0.002, 0.0002)
     (path / YAML).unlink()
     (path / "dso").mkdir()
-    size = f"resolution: [{WIDTH}, {HEIGHT}]"
     (path / "dso" / "camchain.yaml").write_text(
-        f"cam0:\n  camera_model: pinhole\n  intrinsics: [60.5, 61.5, 31.0, 23.0]\n  {size}\n"
-        "  distortion_model: equidistant\n  distortion_coeffs: [0.003, 0.0007, -0.002, 0.0002]\n"
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [60.5, 61.5, 31.0, 23.0]\n"
+        f"  resolution: [{WIDTH}, {HEIGHT}]\n"
+        f"  distortion_model: equidistant\n  distortion_coeffs: [{words(four, ', ')}]\n"
     )
-    four = (0.003, 0.0007, -0.002, 0.0002)
     lens = Calibration(WIDTH, HEIGHT, 60.5, 61.5, 31.0, 23.0, four, model="fisheye")
     assert open_source(path).calibration == lens
 
@@ -128,7 +112,6 @@ def test_what_is_no_video_is_refused_by_file_and_line(write, spoil, message, tmp
         ({"frames": 0}, "frames must be a positive whole number, not 0"),
         ({"start": -1.0}, r"start is -1\.0 s; pictures has frames from 0 to 1\.000 s"),
         ({"start": 1.1}, r"start is 1\.1 s; pictures has frames from 0 to 1\.000 s"),
-        ({"start": float("nan")}, "start is nan s"),
         ({"scale": 0.0}, r"scale must be a positive factor .* not 0\.0"),
         ({"scale": 0.001}, "width would be 0; it must be at least one pixel"),
     ],
@@ -139,15 +122,10 @@ def test_options_that_make_no_sense_are_refused(tmp_path, calibration, options, 
         open_source(path, **({"calibration": calibration, "rate": 10.0} | options))
 
 
-def test_a_rate_that_is_given_times_pictures_without_times(tmp_path, calibration):
+def test_a_selection_of_a_selection_counts_in_the_whole_video(tmp_path, calibration):
     source = open_source(plain(tmp_path), calibration=calibration, rate=20.0)
     np.testing.assert_allclose(source.times, np.arange(11) / 20, rtol=0, atol=1e-12)
-
-
-def test_a_selection_of_a_selection_counts_in_the_whole_video(tmp_path, calibration):
-    path = plain(tmp_path)
-    part = open_source(path, calibration=calibration, rate=10.0, start=0.1, every=2)
-    again = selected(part, start=0.4, every=2)
+    again = selected(selected(source, start=0.05, every=2), start=0.2, every=2)
     assert [frame.index for frame in again] == [5, 9]
     assert brightness(again) == [55, 95]
 
@@ -167,14 +145,6 @@ def test_a_picture_of_seven_scenes_may_lack_its_pose(tmp_path):
     reference = open_source(path).reference
     assert reference is not None
     np.testing.assert_allclose(reference.times, [3 / 30], rtol=0, atol=1e-12)
-
-
-def test_a_picture_of_another_size_is_refused_before_it_is_scaled(tmp_path, calibration):
-    path = plain(tmp_path)
-    cv2.imwrite(str(path / "frame5.png"), np.zeros((HEIGHT, WIDTH + 2), np.uint8))
-    source = open_source(path, calibration=calibration, scale=0.5)
-    with pytest.raises(ValueError, match="image 4 is 66x48, but the calibration is for 64x48"):
-        list(source)
 
 
 def test_a_smaller_picture_and_its_calibration_see_a_point_in_the_same_direction(tmp_path):
@@ -201,7 +171,7 @@ def test_a_smaller_picture_and_its_calibration_see_a_point_in_the_same_direction
 
 @pytest.mark.parametrize(
     ("size", "tracked"),
-    [((1280, 960), (1280, 960)), ((1920, 1080), (960, 540)), ((1080, 2700), (360, 900))],
+    [((1280, 960), (1280, 960)), ((1080, 2700), (360, 900))],
 )
 def test_pictures_too_large_are_made_smaller_with_their_calibration(tmp_path, size, tracked):
     camera = Calibration(size[0], size[1], 1000.0, 1000.0, 500.0, 500.0)
@@ -233,10 +203,6 @@ def test_shared_videos_open(name, frames):
     assert frame.image.shape == (source.calibration.height, source.calibration.width)
     assert frame.image.std() > 5
     assert source.reference is not None
-    turns = source.reference.T_wc[:, :3, :3]
-    np.testing.assert_allclose(
-        turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-9
-    )
 
 
 @pytest.mark.parametrize(

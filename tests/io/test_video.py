@@ -94,42 +94,33 @@ class Told:
         self.released = True
 
 
-def test_times_that_do_not_increase_are_those_of_the_frame_rate(monkeypatch, tmp_path):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1, 0.1, 0.3], []))
+def test_times_of_a_file_are_its_own_where_they_increase(monkeypatch, tmp_path):
+    def times_of(*told, **how):
+        monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told(told, [], **how))
+        return file.read_times(tmp_path / "v.mkv")
+
+    # Of a file that states no number it is computed from its length, here nine pictures'.
+    dropped = [0.0, 0.04, 0.2, 0.32]
+    np.testing.assert_array_equal(times_of(*dropped, stated=9), dropped)
     with pytest.warns(
         UserWarning, match=r"picture 2 is at 0\.100 s, after one .* per second are assumed"
     ):
-        times = file.read_times(tmp_path / "v.mp4")
+        times = times_of(0.0, 0.1, 0.1, 0.3)
     np.testing.assert_allclose(times, np.arange(4) / RATE, rtol=0, atol=1e-12)
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.0], [], rate=0.0))
     with pytest.raises(ValueError, match="its frame rate is unknown"):
-        file.read_times(tmp_path / "v.mp4")
-
-
-def test_a_video_that_ends_early_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1], [], stated=9))
+        times_of(0.0, 0.0, rate=0.0)
     with pytest.warns(UserWarning, match="only 2 of the 9 pictures"):
-        assert len(file.read_times(tmp_path / "v.mp4")) == 2
+        assert len(times_of(0.0, 0.1, stated=9)) == 2
 
 
-def test_pictures_that_were_dropped_are_no_early_end(monkeypatch, tmp_path):
-    """Of a file that states no number it is computed from its length, here nine pictures'."""
-    times = [0.0, 0.04, 0.2, 0.32]
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told(times, [], stated=9))
-    np.testing.assert_array_equal(file.read_times(tmp_path / "v.mkv"), times)
-
-
-def test_a_picture_that_is_gone_when_it_is_reached_is_named(filmed, calibration):
+def test_a_file_that_is_no_video_or_is_none_any_more_is_refused(filmed, calibration):
     source = open_source(filmed, calibration=calibration)
     filmed.write_bytes(b"")
     with pytest.raises(ValueError, match=r"video\.mp4: image 0 cannot be read; the sequence ends"):
         list(source)
-
-
-def test_a_file_that_is_no_video_is_refused(tmp_path, calibration):
-    (tmp_path / "text.mp4").write_text("no video")
+    filmed.write_text("no video")
     with pytest.raises(ValueError, match="cannot be read as a video"):
-        open_source(tmp_path / "text.mp4", calibration=calibration)
+        open_source(filmed, calibration=calibration)
 
 
 class Filming(Told):
@@ -174,14 +165,12 @@ def test_a_reader_faster_than_the_camera_waits_for_the_next_picture(monkeypatch,
     assert np.all(np.diff([frame.time for frame in frames]) > 0)
 
 
-def test_a_camera_without_a_picture_is_refused(monkeypatch, calibration):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda n: Filming(0))
+def test_a_camera_without_a_picture_or_with_a_start_is_refused(monkeypatch, calibration):
     monkeypatch.setattr(camera, "PATIENCE", 0.2)
-    with pytest.raises(ValueError, match="camera 7 delivers no pictures"):
-        open_source("7", calibration=calibration)
-
-
-def test_a_live_camera_has_no_frame_to_start_at(monkeypatch, calibration):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda n: Filming())
-    with pytest.raises(ValueError, match="a live camera starts when it is opened"):
-        open_source("0", calibration=calibration, start=1.0)
+    for count, start, message in (
+        (0, 0.0, "camera 7 delivers no pictures"),
+        (None, 1.0, "a live camera starts when it is opened"),
+    ):
+        monkeypatch.setattr(cv2, "VideoCapture", lambda n, count=count: Filming(count))
+        with pytest.raises(ValueError, match=message):
+            open_source("7", calibration=calibration, start=start)

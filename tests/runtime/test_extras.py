@@ -58,13 +58,6 @@ def test_a_bar_without_tqdm_names_the_cli_extra(monkeypatch):
         bar(3, "run")
 
 
-def test_the_core_brings_mathematics_and_figures_alone():
-    core = tomllib.loads(PROJECT.read_text())["project"]["dependencies"]
-    assert {name.partition(">")[0] for name in core} <= {
-        "equinox", "jax", "jaxlie", "jaxtyping", "matplotlib", "numpy", "optimistix", "scipy",
-    }  # fmt: skip
-
-
 def calls():
     """Extras that calls of `missing` name."""
     for path in PACKAGE.rglob("*.py"):
@@ -73,10 +66,13 @@ def calls():
                 yield ast.literal_eval(node.args[1])
 
 
-def test_every_extra_that_an_error_names_is_one_of_the_projects():
-    named, extras = set(calls()), tomllib.loads(PROJECT.read_text())["project"]
+def test_every_extra_that_an_error_names_is_one_of_the_projects_and_the_core_brings_few():
+    named, project = set(calls()), tomllib.loads(PROJECT.read_text())["project"]
     assert named >= {"cli", "vision", "viewer", "cluster"}
-    assert named <= set(extras["optional-dependencies"])
+    assert named <= set(project["optional-dependencies"])
+    assert {name.partition(">")[0] for name in project["dependencies"]} <= {
+        "equinox", "jax", "jaxlie", "jaxtyping", "matplotlib", "numpy", "optimistix", "scipy",
+    }  # fmt: skip
 
 
 def test_how_an_extra_is_installed_is_said_in_one_place():

@@ -6,15 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import pytest
 
 from jaxslam.cli import main
 
-KILLS = 2
-"""In the tests; `python tests/runtime/test_long_work.py 20` does twenty."""
 COMMAND = [
     "consistency", "--scenario", "matched-tight", "--landmarks", "inverse_scaling", "--steps", "5",
     "--set", "landmarks=3", "--runs", "600", "--chunk", "10",
@@ -30,10 +27,10 @@ def chunks(out):
     return sorted(path.name for path in out.glob("runs/*/[0-9]*.npz"))
 
 
-def killed_at_random(out, seed, kills):
+def killed_at_random(out, kills):
     """The study, killed so often after a random number of chunks more and resumed; how many
     chunks were there at every kill."""
-    choose, found = random.Random(seed), []
+    choose, found = random.Random(0), []
     for _ in range(kills):
         wanted = min(60, len(chunks(out)) + choose.randint(1, 60 // kills))
         process = started(out, "--resume")
@@ -46,23 +43,6 @@ def killed_at_random(out, seed, kills):
     return found
 
 
-def assert_resumes_to_the_same(folder, seed, kills):
-    main([*COMMAND, "--out", str(folder / "whole")])
-    found = killed_at_random(folder / "killed", seed, kills)
-    assert found == sorted(found)  # nothing that was kept is lost
-    main([*COMMAND, "--out", str(folder / "killed"), "--resume"])
-    whole, killed = (json.loads((folder / x / "consistency.json").read_text()) for x in _BOTH)
-    for summary in (whole, killed):
-        for of_filter in summary["filters"].values():
-            del of_filter["seconds"]
-    assert whole == killed
-    assert not list(folder.glob("killed/runs/*/.*"))  # nor is anything half written left
-    return found
-
-
-_BOTH = ("whole", "killed")
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_study_that_is_killed_resumes_to_the_same(tmp_path, monkeypatch):
@@ -70,13 +50,15 @@ def test_a_study_that_is_killed_resumes_to_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", told or str(tmp_path / "programs"))
     monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
-    found = assert_resumes_to_the_same(tmp_path, 0, KILLS)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    main([*COMMAND, "--out", str(whole)])
+    found = killed_at_random(killed, kills=2)
+    assert found == sorted(found)  # nothing that was kept is lost
     assert any(0 < count < 60 for count in found)  # it was killed in mid-study
-
-
-if __name__ == "__main__":
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as name:
-        many = int(sys.argv[1])
-        print(many, "kills, chunks there:", assert_resumes_to_the_same(Path(name), many, many))
+    main([*COMMAND, "--out", str(killed), "--resume"])
+    told = [json.loads((out / "consistency.json").read_text()) for out in (whole, killed)]
+    for summary in told:
+        for of_filter in summary["filters"].values():
+            del of_filter["seconds"]
+    assert told[0] == told[1]
+    assert not list(killed.glob("runs/*/.*"))  # nor is anything half written left

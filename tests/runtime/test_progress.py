@@ -4,8 +4,6 @@ import io
 import sys
 import time
 
-import pytest
-
 from jaxslam._runtime import progress
 
 
@@ -24,20 +22,14 @@ def written(monkeypatch, file, patience=0.0):
     return file.getvalue()
 
 
-def test_a_terminal_has_a_bar_that_is_drawn_over(monkeypatch):
+def test_a_terminal_has_a_bar_and_a_log_has_lines_unless_it_is_short(monkeypatch):
     text = written(monkeypatch, Terminal())
     assert "\r" in text
     assert "20/20" in text
-
-
-def test_a_log_has_lines_without_control_characters(monkeypatch):
     lines = written(monkeypatch, io.StringIO()).splitlines()
     assert "waiting" in lines[0]
     assert "20/20" in lines[-1]
     assert all(line.isprintable() and len(line) <= 80 for line in lines)
-
-
-def test_what_is_short_leaves_no_line_in_a_log(monkeypatch):
     assert written(monkeypatch, io.StringIO(), patience=10.0) == ""
 
 
@@ -49,8 +41,10 @@ def test_a_study_that_is_short_leaves_no_line_in_a_log(monkeypatch):
         for name, runs in (("a", 0), ("a", 0), ("a", 100), ("b", 0), ("b", 0), ("b", 100)):
             move(name, runs)
     with progress.warming_bar(3, "frame", "compiling", 2, "tracking") as update:
-        for _ in range(3):
-            update(1)
+        update(3)
+    with progress.bar(None, "frame") as shown:  # which needs no total
+        shown.update(1)
+        assert shown.n == 1
     assert log.getvalue() == ""
 
 
@@ -87,16 +81,6 @@ def test_no_time_is_left_to_tell_before_it_is_warm(monkeypatch):
     assert "4/10 [00:02<00:06" in warm
 
 
-def test_a_study_moves_a_bar_to_its_end(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    move = progress.StudyBar(4)
-    for name, done in (("a", 2), ("b", 1), ("b", 1)):  # as monte_carlo calls it
-        move(name, done)
-    assert "4/4" in terminal.getvalue()
-    assert terminal.getvalue().endswith("\n")  # closed
-
-
 def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
@@ -108,6 +92,11 @@ def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     last = terminal.getvalue().split("\r")[-1]
     assert last.startswith("a: 100%")
     assert "10/10" in last
+    assert last.endswith("\n")  # closed
+    move = progress.StudyBar(4)
+    for name, runs in (("a", 2), ("b", 2)):  # on a cluster
+        move(name, runs)
+    assert "b: 100%" in terminal.getvalue()
 
 
 def test_the_time_left_of_a_study_is_that_of_its_runs(monkeypatch):
@@ -130,11 +119,3 @@ def test_the_time_left_of_a_study_is_that_of_its_runs(monkeypatch):
     assert "a:  50%|#####     | 20/40 [00:10<00:10" in terminal.getvalue().replace("█", "#")
     assert "30/40 [00:02<00:02" in terminal.getvalue()
     assert not [line for line in told if "1:00:" in line]
-
-
-@pytest.mark.parametrize("total", [None, 3])
-def test_a_bar_needs_no_total(monkeypatch, total):
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
-    with progress.bar(total, "frame") as shown:
-        shown.update(1)
-        assert shown.n == 1

@@ -25,13 +25,6 @@ def test_a_right_filter_covers_what_its_sets_say(dof):
     assert found == tuple(float(np.mean(nees <= stats.chi2.ppf(share, dof))) for share in SETS)
 
 
-def test_uniform_errors_of_the_right_variance_have_no_tails():
-    z = np.random.default_rng(0).uniform(-(3**0.5), 3**0.5, size=(50, 100, 3))
-    nees = np.sum(z**2, axis=2)
-    assert np.mean(nees) == pytest.approx(3, abs=0.05)
-    assert coverage(nees, 3, every(nees))[-1] == 1
-
-
 def test_steps_that_were_not_logged_count_nowhere():
     z = drawn("white", 20, 50)
     there = every(z)
@@ -47,7 +40,7 @@ def test_steps_that_were_not_logged_count_nowhere():
     np.testing.assert_allclose(bias(holes, there).mean, means.mean(axis=0), rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["white", "AR(1), τ = 10", "AR(1), τ = 300", "a third constant"])
+@pytest.mark.parametrize("kind", ["white", "AR(1), τ = 300", "a third constant"])
 @pytest.mark.parametrize(("runs", "steps"), [(1, 200), (3, 50), (30, 20)])
 def test_of_right_filters_few_have_a_bias_or_a_correlation(kind, runs, steps):
     """More than 10 of 200 are, with a rate of 1 % each, one test of 10 million."""

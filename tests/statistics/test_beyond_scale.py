@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, each_geometry, named, pose, quick_jit, quick_rows
+from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
 from jaxslam.consistency import filter_run, sums
@@ -72,7 +72,7 @@ def test_it_is_chi_square_with_one_degree_of_freedom_fewer(geometry):
     assert 0.99 * low < np.sum((found.log_scale / found.sigma) ** 2) < 1.01 * high
 
 
-@pytest.mark.parametrize("factor", [0.05, 0.7, 1.3, 30.0])
+@pytest.mark.parametrize("factor", [0.05, 30.0])
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_pure_error_of_scale_is_nothing_beyond_it(geometry, factor):
     truth, P = pose(geometry, 3), covariance(geometry.tangent_dim)
@@ -83,23 +83,9 @@ def test_a_pure_error_of_scale_is_nothing_beyond_it(geometry, factor):
         np.testing.assert_allclose(found.log_scale, np.log(factor), rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_it_does_not_depend_on_what_is_claimed_of_the_scale(geometry):
-    truth, g, error = linear_case(geometry)
-    P, noise = covariance(geometry.tangent_dim), 0.02 * jnp.ones(geometry.tangent_dim)
-    first, other = (
-        beyond_scale(lambda T, c=c: (error(T, noise), P + c * jnp.outer(g, g)), truth)
-        for c in (0.0, 9.0)
-    )
-    np.testing.assert_allclose(first.nees, other.nees, rtol=1e-8)
-    np.testing.assert_allclose(first.log_scale, other.log_scale, rtol=1e-8)
-    # σ² of log s is that of s, which grows by c, over s².
-    s = np.exp(first.log_scale)
-    np.testing.assert_allclose(other.sigma**2 - first.sigma**2, 9.0 / s**2, rtol=1e-7)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-12])
+@pytest.mark.parametrize(
+    ("dtype", "distance"), [("float32", 0.0), ("float32", 1e-30), ("float64", 1e-12)]
+)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_without_a_displacement_there_is_no_scale_and_no_nan(geometry, distance, dtype):
     P = jnp.asarray(covariance(geometry.tangent_dim), dtype)
@@ -109,11 +95,9 @@ def test_without_a_displacement_there_is_no_scale_and_no_nan(geometry, distance,
     found = beyond_scale(lambda T: (difference(T, estimate), P), truth)
     whole = normalised_squared(difference(truth, estimate), P)
     np.testing.assert_allclose(found.nees, whole, rtol=1e-4)
-    assert np.isfinite(found.log_scale)
     assert found.sigma > 1e6
-    if not distance:
-        assert found.log_scale == 0
-        assert np.isinf(found.sigma)
+    assert np.isfinite(found.log_scale)
+    assert distance or (found.log_scale, found.sigma) == (0, np.inf)
 
 
 def test_a_reversed_path_is_best_explained_by_none():
@@ -130,11 +114,10 @@ def test_a_reversed_path_is_best_explained_by_none():
     assert reversal(behind, scaled(near, jnp.asarray(1.02))) == 1
 
 
-@pytest.mark.parametrize("geometry", quick_rows(1, each_geometry), ids=named)
-def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
+def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate():
     """An estimate that is right in its own unit, against truths that are not."""
-    t, count = geometry.tangent_dim, 3000
-    truth, sigma = pose(geometry, 1), 1e-3 * np.linspace(1.0, 2.0, t)
+    t, count = 3, 3000
+    truth, sigma = pose(PLANAR, 1), 1e-3 * np.linspace(1.0, 2.0, t)
     estimate, P = scaled(truth, jnp.asarray(4.0)), 1e-6 * covariance(t)
     keys = jax.random.split(jax.random.key(0))
     noises = sigma * jax.random.normal(keys[0], (count, t))
@@ -142,8 +125,7 @@ def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
 
     def one(noise, own_noise):
         near = retract(truth, noise)
-        of = lambda T: (difference(T, estimate) + own_noise, P)  # noqa: E731
-        return beyond_scale(of, near, sigma)
+        return beyond_scale(lambda T: (difference(T, estimate) + own_noise, P), near, sigma)
 
     found = quick_jit(jax.vmap(one))(noises, own_noises)
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count * (t - 1))
@@ -152,15 +134,6 @@ def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
     normalised = (found.log_scale - np.log(4.0)) / found.sigma
     assert 0.99 * low < np.sum(normalised**2) < 1.01 * high
-
-    # Without the truth's noise it is far too large.
-    @quick_jit
-    def both(noise, no_noise):
-        of = lambda T: (difference(T, estimate), P)  # noqa: E731
-        return beyond_scale(of, retract(truth, noise)), one(noise, no_noise)
-
-    bare, told = both(noises[0], 0 * own_noises[0])
-    assert bare.nees > 2 * told.nees
 
 
 @pytest.mark.slow
@@ -215,13 +188,11 @@ def test_one_scale_is_the_least_sum_over_the_run():
     A = jnp.asarray(np.random.default_rng(1).normal(size=(3, 2)))
     noises = 0.05 * np.random.default_rng(2).normal(size=(K, 3))
     P = covariance(3)
-    errors = [
-        lambda T, truth=truth, noise=noise: (
-            A @ (T.translation() - 1.1 * truth.translation()) + noise,
-            P,
-        )
-        for truth, noise in zip(truths, noises, strict=True)
-    ]
+
+    def of(truth, noise):
+        return lambda T: (A @ (T.translation() - 1.1 * truth.translation()) + noise, P)
+
+    errors = [of(*each) for each in zip(truths, noises, strict=True)]
     each = [beyond_scale(error, truth) for error, truth in zip(errors, truths, strict=True)]
     found = one_scale(*(np.array(x) for x in zip(*each, strict=True)))
 
@@ -233,11 +204,8 @@ def test_one_scale_is_the_least_sum_over_the_run():
     best = float(np.exp(found.log_scale))
     np.testing.assert_allclose(found.nees, at(best), rtol=1e-8)
     assert at(best).sum() < min(at(0.999 * best).sum(), at(1.001 * best).sum())
-    np.testing.assert_allclose(found.nees, each_nees(each) + found.normalised, rtol=1e-12)
-
-
-def each_nees(each):
-    return np.array([float(best.nees) for best in each])
+    alone = np.array([float(best.nees) for best in each])
+    np.testing.assert_allclose(found.nees, alone + found.normalised, rtol=1e-12)
 
 
 def test_of_independent_poses_one_degree_of_freedom_goes_once_and_not_once_a_pose():

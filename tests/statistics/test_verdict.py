@@ -1,9 +1,10 @@
-"""Tests of the verdict on one study: its rate of false alarms, its coverage, what it says."""
+"""Tests of the verdict on one study; `benchmarks/verdicts.py` counts how often it is wrong."""
 
 import json
 
 import numpy as np
 import pytest
+import verdicts as benchmark
 from scipy import stats
 
 from jaxslam.statistics import Tally, lost_threshold, not_disproved, run_verdict
@@ -15,7 +16,7 @@ from jaxslam.statistics.bands import (
     skewed_limit,
 )
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
-from jaxslam.statistics.verdict import sentences
+from jaxslam.statistics.verdict import brief, sentences
 
 
 def shortfalls(dof, level):
@@ -24,13 +25,7 @@ def shortfalls(dof, level):
 
 def series(rng, runs, steps=20, dof=3, correlation=0.95):
     """NEES of a consistent filter, (runs, steps): χ² at every step, whatever the correlation."""
-    error = rng.normal(size=(runs, dof))
-    nees = np.empty((runs, steps))
-    for step in range(steps):
-        nees[:, step] = np.sum(error**2, axis=1)
-        new = rng.normal(size=error.shape)
-        error = correlation * error + np.sqrt(1 - correlation**2) * new
-    return nees
+    return benchmark.series(rng, runs, dof, steps, correlation)
 
 
 def studies(count, runs, seed=0, **of):
@@ -51,25 +46,13 @@ def words(many, dof=3):
     return [Tally.of(nees, dof).decisive().word for nees in many]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dof", [1, 6])
-@pytest.mark.parametrize("runs", [3, 10, 100])
-@pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.0), (8, 0.98)])
-def test_a_right_filter_is_called_inconsistent_in_less_than_one_of_a_hundred_studies(
-    dof, runs, steps, correlation
-):
-    """Of 400 studies 4 expected at most; 13 or more have a chance of 1 in 3000."""
-    many = studies(400, runs, dof=dof, steps=steps, correlation=correlation)
-    assert sum(word.endswith("confident") for word in words(many, dof)) < 13
-
-
-@pytest.mark.parametrize("runs", [1, 3, 10, 60, 200])
+@pytest.mark.parametrize("runs", [1, 10, 200])
 @pytest.mark.parametrize("factor", [1.3, 1 / 1.3])
 def test_a_sigma_wrong_by_30_percent_is_not_called_consistent(runs, factor):
-    """Of 200 studies 2 are allowed, and 9 or more have a chance of 1 in 4000."""
+    """Of 100 studies one is allowed, and 7 or more have a chance of 1 in 10 000."""
     for correlation in (0.0, 0.98):
-        many = factor**2 * studies(200, runs, steps=6, correlation=correlation)
-        assert words(many).count("consistent") < 9
+        many = factor**2 * studies(100, runs, steps=6, correlation=correlation)
+        assert words(many).count("consistent") < 7
 
 
 def test_of_next_to_no_degrees_of_freedom_runs_are_counted_too():
@@ -89,48 +72,14 @@ def test_with_runs_enough_a_right_filter_is_consistent_and_with_fewer_nobody_can
     assert f"; about {few['enough']} runs would tell" in sentences(few)[0]
 
 
-@pytest.mark.parametrize("dof", [2, 3])
-def test_one_long_run_with_sigma_half_of_right_is_not_consistent(dof):
-    """However many steps: they may be all but one."""
-    many = 4 * studies(50, 1, dof=dof, steps=200, correlation=0.999)
-    assert words(many, dof).count("consistent") == 0
-
-
-def test_the_verdict_is_the_words_of_what_decides():
-    for nees in studies(40, 30) * np.linspace(0.5, 2, 40)[:, None, None]:
-        assert run_verdict(nees, 3)["word"] == Tally.of(nees, 3).decisive().word
-
-
-@pytest.mark.parametrize("dof", [3, 6])
-def test_a_sigma_wrong_by_5_percent_is_found_with_2000_runs(dof):
+def test_a_sigma_wrong_by_5_percent_is_found_with_2000_runs():
     """In 95 of 100 studies, or more, though the steps of a run are all but one."""
-    found = {"over-confident": 1.05, "under-confident": 1 / 1.05}
-    for word, factor in found.items():
-        verdicts = [
-            run_verdict(factor**2 * nees, dof) for nees in studies(40, 2000, dof=dof, steps=10)
-        ]
-        assert np.mean([verdict["word"] == word for verdict in verdicts]) > 0.9
-        low, high = np.array([verdict["interval99"] for verdict in verdicts]).T
+    for word, factor in {"over-confident": 1.05, "under-confident": 1 / 1.05}.items():
+        found = [run_verdict(factor**2 * nees, 3) for nees in studies(30, 2000, steps=10)]
+        assert np.mean([verdict["word"] == word for verdict in found]) > 0.9
+        low, high = np.array([verdict["interval99"] for verdict in found]).T
         assert np.mean((low < factor) & (factor < high)) > 0.93
         assert np.mean(high - low) < 0.08
-
-
-def test_the_interval_holds_the_mean_of_skewed_numbers():
-    rng = np.random.default_rng(1)
-    numbers, mean = np.exp(rng.normal(size=(1000, 100))), np.exp(0.5)
-    looks = [Look("", PowerSums.of(row), (1.0, 1.0), 0.01) for row in numbers]
-    low, high = np.array([look.interval for look in looks]).T
-    assert np.mean((low > mean) | (high < mean)) < 0.025
-
-
-@pytest.mark.parametrize(("runs", "count"), [(100, 500), (200, 500), (1000, 200)])
-def test_the_interval_holds_a_mean_that_one_run_in_a_hundred_makes(runs, count):
-    """Of twenty times the variance: in a third of the studies of 100 runs there is none."""
-    many = studies(count, runs, steps=1)
-    many[np.random.default_rng(1).random((count, runs)) < 0.01] *= 20
-    intervals = np.array([Tally.of(nees, 3).looks()[0].interval for nees in many])
-    held = (intervals[:, 0] <= 1.19) & (intervals[:, 1] >= 1.19)
-    assert np.mean(held) > 0.97
 
 
 def test_the_limit_of_skewed_numbers_is_where_their_p_value_is_the_level():
@@ -142,27 +91,17 @@ def test_the_limit_of_skewed_numbers_is_where_their_p_value_is_the_level():
     assert skewed_limit(even, t) == t
 
 
-@pytest.mark.parametrize("runs", [1, 2, 3, 20, 200])
+@pytest.mark.parametrize("runs", [1, 3, 200])
 def test_word_interval_and_p_value_say_the_same(runs):
-    for scale in np.geomspace(0.2, 6, 40):
+    for scale in np.geomspace(0.2, 6, 20):
         nees = scale * studies(1, runs, steps=6, seed=runs)[0]
         found = run_verdict(nees, 3)
         for each in (found, found["mean"], found["end"], *found["thirds"]):
             low, high = limits(each)
             assert (low <= 1 <= high) == (each["p"] >= 0.01) == not_disproved(each)
             assert low <= each["sigma_factor"] <= high
-        assert found["p"] == min(
-            each["p"] for each in (found["mean"], found["end"], *found["thirds"])
-        )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("correlation", [0.0, 0.9, 1.0])
-def test_no_sum_is_in_the_tails_of_chi2_more_often_than_its_shortfall_lets_it(correlation):
-    means = studies(4000, 5, steps=5, correlation=correlation).mean(axis=(1, 2))
-    p = np.array([shortfall_p_value(mean, 3, 5) for mean in means])
-    for level in (0.3, 0.1, 0.03):
-        assert np.mean(p < level) < level
+        looks = (found["mean"], found["end"], *found["thirds"])
+        assert found["p"] == min(each["p"] for each in looks)
 
 
 def test_the_limits_are_the_expected_shortfall():
@@ -192,54 +131,33 @@ def test_the_interval_of_chi2_is_what_is_left_of_few_runs_and_that_of_scatter_of
 # --- opposite faults ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.98])
-def test_faults_that_cancel_in_the_mean_are_found_in_the_parts(correlation):
-    ramp = np.linspace(0.7, 1.3, 30)
-    nees = ramp * series(np.random.default_rng(4), 400, steps=30, correlation=correlation)
+def test_faults_that_cancel_in_the_mean_are_found_in_the_parts():
+    nees = np.linspace(0.7, 1.3, 30) * studies(1, 400, seed=4, steps=30, correlation=0.98)[0]
     found = run_verdict(nees, 3)
     assert found["mean"]["word"] == "consistent"
     assert found["word"] in ("over-confident", "under-confident")
     first, middle, last = (third["sigma_factor"] for third in found["thirds"])
     assert first < 0.95 < middle < 1.05 < last
-    assert (found["thirds"][0]["word"], found["thirds"][2]["word"]) == (
-        "under-confident",
-        "over-confident",
-    )
+    words = [third["word"] for third in found["thirds"]]
+    assert words[::2] == ["under-confident", "over-confident"]
     where = {"last step": "at the last step"}.get(found["of"], f"in the {found['of']}")
     assert sentences(found)[0].startswith(f"{where} NEES {found['nees']:.2f}, σ too ")
     assert sentences(found)[1].startswith("over all steps: NEES ")
 
 
-def test_the_end_alone_decides_where_only_it_is_wrong():
-    nees = studies(1, 100, steps=60, correlation=0.0)[0]
-    nees[:, -1] *= 3
-    found = run_verdict(nees, 3)
-    assert (found["word"], found["of"]) == ("over-confident", "last step")
-    assert found["nees"] == pytest.approx(nees[:, -1].mean())
-    assert found["interval99"] == found["end"]["interval99"]
-
-
 @pytest.mark.parametrize("steps", [1, 2, 3])
-def test_what_all_looks_may_fail_together_is_one_in_a_hundred(steps):
+def test_short_runs_have_the_parts_that_they_have_and_all_may_fail_one_time_in_a_hundred(steps):
     """Bonferroni: half for the mean over all steps, the other half shared by the parts."""
-    looks = Tally.of(np.random.default_rng(0).chisquare(3, (20, steps)), 3).looks()
-    levels = [look.level for look in looks]
-    assert sum(levels) == pytest.approx(1 - VERDICT_CONFIDENCE)
-    if steps > 1:
-        assert levels[0] == pytest.approx(sum(levels[1:]))
-    assert len(set(levels[1:])) == min(len(levels) - 1, 1)
-
-
-@pytest.mark.parametrize("steps", [1, 2, 3])
-def test_short_runs_have_the_parts_that_they_have(steps):
     nees = studies(1, 100, steps=steps, correlation=0.5)[0]
+    levels = [look.level for look in Tally.of(nees, 3).looks()]
+    assert sum(levels) == pytest.approx(1 - VERDICT_CONFIDENCE)
+    assert steps == 1 or levels[0] == pytest.approx(sum(levels[1:]))
+    assert len(set(levels[1:])) == min(len(levels) - 1, 1)
     found = run_verdict(nees, 3)
-    assert len(found["thirds"]) == (3 if steps == 3 else 0)
-    assert found["end"]["nees"] == pytest.approx(nees[:, -1].mean())
     assert found["word"] == "consistent"
-    if steps == 3:
-        thirds = [third["nees"] for third in found["thirds"]]
-        assert thirds == pytest.approx(list(nees.mean(axis=0)))
+    assert found["end"]["nees"] == pytest.approx(nees[:, -1].mean())
+    thirds = [third["nees"] for third in found["thirds"]]
+    assert thirds == pytest.approx(nees.mean(axis=0).tolist() if steps == 3 else [])
 
 
 def test_thirds_are_of_the_steps_that_each_run_has():
@@ -277,33 +195,15 @@ def test_a_few_lost_runs_are_named_and_judged_apart():
     )
 
 
-def test_of_runs_that_are_chosen_by_their_nees_no_verdict_is_said():
+def test_a_run_that_is_lost_and_comes_back_was_lost():
+    """By the quantile of its own number of steps."""
     nees = consistent()
-    nees[:11, 5] = 1e3
+    nees[:11, 7] = 1.001 * lost_threshold(3, 20)
+    found = run_verdict(nees, 3)
+    assert (found["lost"], found["lost_runs"]) == (0.011, list(range(11)))
     named = "runs 0, 1, 2, 3, 4, 5, 6, 7 and 3 more"
     rest = f"the 989 never lost: NEES {nees[11:].mean():.2f}"
-    expected = f"11 of 1000 runs were lost ({named}), {rest}"
-    assert sentences(run_verdict(nees, 3))[2] == expected
-
-
-def test_a_run_that_is_lost_and_comes_back_was_lost():
-    nees = consistent()
-    nees[4, 7] = 1.001 * lost_threshold(3, 20)
-    found = run_verdict(nees, 3)
-    assert (found["lost"], found["lost_runs"]) == (0.001, [4])
-
-
-@pytest.mark.parametrize("steps", [1, 1000])
-def test_of_right_runs_one_in_10000_is_lost_however_many_steps_they_have(steps):
-    """With independent steps exactly; the quantile of one step would lose 10 % of long runs."""
-    limit = lost_threshold(3, steps)
-    assert 1 - stats.chi2.cdf(limit, 3) ** steps == pytest.approx(1e-4, rel=1e-3)
-    nees = np.random.default_rng(13).chisquare(3, (2000, steps))
-    assert run_verdict(nees, 3)["lost"] <= 3 / 2000
-    assert lost_threshold(3) == pytest.approx(21.1, abs=0.05)
-
-
-def test_a_short_run_is_lost_by_the_quantile_of_its_own_steps():
+    assert sentences(found)[2].startswith(f"11 of 1000 runs were lost ({named}), {rest}")
     nees = np.full((2, 1000), 3.0)
     nees[:, 0] = 22.0
     logged = np.ones(nees.shape, bool)
@@ -311,11 +211,12 @@ def test_a_short_run_is_lost_by_the_quantile_of_its_own_steps():
     assert run_verdict(nees, 3, logged=logged)["lost_runs"] == [1]
 
 
-def test_without_lost_runs_a_consistent_filter_seems_better_by_less_than_half_a_percent():
-    nees = series(np.random.default_rng(7), 20000, steps=60, correlation=0.97)
-    verdict = run_verdict(nees, 3)
-    assert 0.999 < verdict["never_lost"]["nees"] / verdict["nees"] < 1
-    assert 0 < verdict["lost"] < 3e-4
+def test_of_right_runs_one_in_10000_is_lost_however_many_steps_they_have():
+    """With independent steps exactly; the quantile of one step would lose 10 % of long runs."""
+    assert lost_threshold(3) == pytest.approx(21.1, abs=0.05)
+    for steps in (1, 1000):
+        limit = lost_threshold(3, steps)
+        assert 1 - stats.chi2.cdf(limit, 3) ** steps == pytest.approx(1e-4, rel=1e-3)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -326,17 +227,11 @@ def test_with_a_diverged_run_there_is_no_mean(value):
     assert (verdict["word"], verdict["nees"], verdict["sigma_factor"]) == ("lost", None, None)
     assert (verdict["p"], verdict["end"]["p"], verdict["diverged"]) == (0.0, 0.0, 1)
     assert verdict["never_lost"]["word"] == "consistent"
-    json.dumps(verdict, allow_nan=False)
     assert sentences(verdict)[0] == "1 of 1000 runs diverged, no mean NEES: lost"
-
-
-@pytest.mark.parametrize("value", [np.nan, 1e5, 1e200])
-def test_a_study_of_lost_runs_only_has_a_verdict(value):
-    verdict = run_verdict(np.full((4, 3), value), 3)
-    json.dumps(verdict, allow_nan=False)
-    assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
-    assert verdict["never_lost"]["runs"] == 0
-    assert sentences(verdict)[-1] == "all 4 runs were lost"
+    none_left = run_verdict(np.full((4, 3), value), 3)
+    json.dumps([verdict, none_left], allow_nan=False)
+    assert none_left["never_lost"]["runs"] == 0
+    assert sentences(none_left)[-1] == "all 4 runs were lost"
 
 
 # --- degrees of freedom that a fit may have taken -------------------------------------------------
@@ -362,17 +257,11 @@ def test_anything_between_all_and_what_a_fit_leaves_is_right(mean, word, factor)
     assert not_disproved(found) is (word == "consistent")
 
 
-def test_what_may_be_fitted_is_no_proof_that_sigma_is_right():
-    """Of a drift of one dof only σ too small can be proven: with few runs that it is not cannot."""
-    nees = np.random.default_rng(11).chisquare(1, (400, 4))
-    assert run_verdict(nees, 1, fitted=1)["word"] == "consistent"
-    assert run_verdict(nees[:10], 1, fitted=1)["word"] == "cannot tell"
-    assert run_verdict(0.1 * nees[:30], 1, fitted=1)["word"] == "consistent"
-
-
-@pytest.mark.parametrize("runs", [1, 3, 300])
+@pytest.mark.parametrize("runs", [1, 3, 400])
 def test_where_all_may_be_fitted_only_over_confidence_can_be_proven(runs):
+    """Of a drift of one dof: with few runs that σ is not too small cannot be proven either."""
     nees = np.random.default_rng(11).chisquare(1, (runs, 4))
+    assert run_verdict(nees, 1, fitted=1)["word"] == ("consistent" if runs > 3 else "cannot tell")
     for factor in (0.0, 1e-6, 1.0):
         found = run_verdict(factor * nees, 1, fitted=1)
         assert not_disproved(found)
@@ -381,50 +270,20 @@ def test_where_all_may_be_fitted_only_over_confidence_can_be_proven(runs):
     assert run_verdict(40 * nees, 1, fitted=1)["word"] == "over-confident"
 
 
-def test_tallies_with_a_fit_add_up_and_no_others_are_of_one_study():
-    nees = np.random.default_rng(12).chisquare(3, (20, 4))
-    one, other = Tally.of(nees[:5], 3, 0.5), Tally.of(nees[5:], 3, 0.5)
-    assert Tally.from_dict(json.loads(json.dumps(one.asdict()))) == one
-    assert Tally.of_numbers(one.numbers() + other.numbers(), 3, 0.5) == one + other
-    with pytest.raises(ValueError, match=r"with 0\.5 and 0\.0 fitted degrees"):
-        one + Tally.of(nees, 3)
-    for fitted in (-0.1, 3.1, np.nan):
-        with pytest.raises(ValueError, match="fitted must be from 0 to the 3 degrees of freedom"):
-            run_verdict(nees, 3, fitted)
-
-
 # --- what it is made of -------------------------------------------------------------------------
 
 
-def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole():
+@pytest.mark.parametrize("fitted", [0.0, 0.5])
+def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole(fitted):
     nees = series(np.random.default_rng(8), 300)
     nees[0, 2], nees[200, 3] = np.nan, 1e3
-    parts = [Tally.of(part, 3) for part in (nees[:100], nees[100:])]
-    stored = [Tally.from_dict(json.loads(json.dumps(part.asdict()))) for part in parts]
-    assert stored == parts
-    together, whole = (parts[0] + parts[1]).verdict(), Tally.of(nees, 3).verdict()
+    parts = [Tally.of(part, 3, fitted) for part in (nees[:100], nees[100:])]
+    assert [Tally.from_dict(json.loads(json.dumps(part.asdict()))) for part in parts] == parts
+    whole, both = Tally.of(nees, 3, fitted).verdict(), parts[0] + parts[1]
+    assert Tally.of_numbers(parts[0].numbers() + parts[1].numbers(), 3, fitted) == both
+    together = both.verdict()
     assert (together["lost"], together["diverged"]) == (whole["lost"], whole["diverged"])
     assert together["never_lost"]["interval99"] == pytest.approx(whole["never_lost"]["interval99"])
-    with pytest.raises(ValueError, match="runs with 3 and 6 degrees of freedom cannot be pooled"):
-        parts[0] + Tally.of(nees, 6)
-
-
-def test_a_tally_is_numbers_that_add_up():
-    draw = np.random.default_rng(3)
-    both = [draw.chisquare(3, size=(n, 7)) for n in (30, 20)]
-    both[1][3, 2:] = np.nan
-    both[0][5, 4] = 1e3
-    one, other = (Tally.of(nees, 3) for nees in both)
-    assert Tally.of_numbers(one.numbers() + other.numbers(), 3) == one + other
-    assert (one + other).lost == 2
-
-
-def test_power_sums_have_the_moments_of_their_numbers():
-    values = np.random.default_rng(9).gamma(2.0, size=50)
-    sums = PowerSums.of(values)
-    assert sums.mean == pytest.approx(values.mean())
-    assert sums.deviation == pytest.approx(values.std(ddof=1))
-    assert sums.skewness == pytest.approx(stats.skew(values))
 
 
 def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
@@ -441,30 +300,46 @@ def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
     ("factor", "text"),
     [
         (1.0, "σ right up to a factor 1.00 [0.96, 1.05]: consistent"),
-        (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident"),
-        (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident"),
+        (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident (p < 0.0001)"),
+        (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident (p < 0.0001)"),
     ],
 )
 def test_a_verdict_is_said_in_words(factor, text):
     nees = consistent()
-    nees *= 3 * factor**2 / nees.mean()
-    nees = np.minimum(nees, lost_threshold(3))
+    nees = np.minimum(nees * 3 * factor**2 / nees.mean(), lost_threshold(3))
     found = run_verdict(nees, 3)
     said, at_the_end = sentences(found)[:2]
-    p = f"p = {found['p']:.2g}" if factor == 1 else "p < 0.0001"
-    assert said == f"NEES {found['nees']:.2f}, {text} ({p})"
+    assert said.startswith(f"NEES {found['nees']:.2f}, {text}")
+    assert brief(found).startswith(f"{found['word']}, σ × {found['sigma_factor']:.2f} [")
     assert at_the_end.startswith(f"at the last step: NEES {nees[:, -1].mean():.2f}, σ ")
-    assert found["end"]["word"] == found["word"]
 
 
-@pytest.mark.parametrize(("shape", "dof"), [((3,), 3), ((0, 4), 3), ((4, 0), 3), ((4, 5), 0)])
+TALLY = Tally.of(np.ones((5, 4)), 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: run_verdict(np.ones(3), 3), "NEES must be"),
+        (lambda: run_verdict(np.ones((0, 4)), 3), "NEES must be"),
+        (lambda: run_verdict(np.ones((4, 0)), 3), "NEES must be"),
+        (lambda: run_verdict(np.ones((4, 5)), 0), "NEES must be"),
+        (lambda: run_verdict(np.ones((4, 5)), 3, logged=np.arange(20).reshape(4, 5) < 15),
+         "at least one step per run"),
+        (lambda: run_verdict(np.ones((4, 5)), 3, -0.1), "fitted must be from 0 to the 3 degrees"),
+        (lambda: run_verdict(np.ones((4, 5)), 3, 3.1), "fitted must be from 0 to the 3 degrees"),
+        (lambda: run_verdict(np.ones((4, 5)), 3, np.nan), "fitted must be from 0 to the 3 degrees"),
+        (lambda: TALLY + Tally.of(np.ones((5, 4)), 6), "runs with 3 and 6 degrees of freedom cann"),
+        (lambda: TALLY + Tally.of(np.ones((5, 4)), 3, 0.5), r"with 0\.0 and 0\.5 fitted degrees"),
+    ],
+)  # fmt: skip
 @pytest.mark.usefixtures("unchecked")
-def test_what_is_no_study_is_refused(shape, dof):
-    with pytest.raises(ValueError, match="NEES must be"):
-        run_verdict(np.ones(shape), dof)
+def test_what_is_no_study_or_not_of_one_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
-@pytest.mark.parametrize("size", [1e-220, 1e-120, 1e120, 1e160])
+@pytest.mark.parametrize("size", [1e-220, 1e160])
 def test_runs_beyond_all_measure_have_a_verdict(size):
     """No power of their NEES may end the verdict instead."""
     nees = size * np.random.default_rng(0).chisquare(3, (20, 4))
@@ -487,24 +362,10 @@ def test_every_run_is_averaged_over_the_steps_that_it_has():
     ends = np.append(nees[0, 4], nees[1:, -1])
     assert found["end"]["nees"] == pytest.approx(ends.mean(), rel=1e-12)
     assert run_verdict(nees, 3, logged=np.ones(nees.shape, bool)) == run_verdict(nees, 3)
-
-
-def test_a_nees_that_is_logged_and_not_finite_is_of_a_run_that_diverged():
-    nees = series(np.random.default_rng(8), 40)
-    logged = np.ones(nees.shape, bool)
-    logged[0, 5:] = False
-    nees[0, 5:], nees[0, 2] = np.nan, np.inf
-    assert run_verdict(nees, 3, logged=logged)["diverged"] == 1
-    assert run_verdict(nees, 3)["diverged"] == 1
-    nees[0, 2], nees[0, 3] = 1.0, 1e6
-    assert run_verdict(nees, 3, logged=logged)["lost"] == 1 / 40
-
-
-def test_a_run_without_a_step_is_refused():
-    logged = np.ones((4, 5), bool)
-    logged[2] = False
-    with pytest.raises(ValueError, match="at least one step per run"):
-        run_verdict(np.ones((4, 5)), 3, logged=logged)
+    broken[0, 2] = np.inf
+    assert run_verdict(broken, 3, logged=logged)["diverged"] == 1
+    broken[0, 2] = 1e6
+    assert run_verdict(broken, 3, logged=logged)["lost"] == 1 / 40
 
 
 @pytest.mark.slow
