@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from cases import quick_rows
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb
 
@@ -48,12 +47,6 @@ def test_the_estimate_is_interrupted_where_it_was_only_predicted(drawn):
     predicted = np.isfinite(line(axis, "lost: only predicted")[:, 0])
     # It joins what was tracked before and after.
     assert np.flatnonzero(predicted).tolist() == [9, 10, 11, 12, 13]
-
-
-def test_nothing_lost_and_no_reference_are_not_in_the_legend(drawn):
-    axis = drawn(path_along_x(), *wall())["from above"]
-    labels = axis.get_legend_handles_labels()[1]
-    assert not {"lost: only predicted", "reference", "a map begins, 95 % of where"} & set(labels)
 
 
 def test_the_line_breaks_where_a_map_begins(drawn):
@@ -149,9 +142,7 @@ def test_landmarks_have_their_ellipses_in_the_figure_and_in_its_file(drawn, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
 
 
-@pytest.mark.parametrize(
-    ("length", "width"), quick_rows(2, [(100.0, 20.0), (0.2, 1.0), (3.0, 1.0), (5.0, 9.0)])
-)
+@pytest.mark.parametrize(("length", "width"), [(100.0, 20.0), (0.2, 1.0)])
 def test_titles_labels_and_legend_have_room(drawn, length, width):
     """None is cut off or drawn over another."""
     figure = drawn(
@@ -175,6 +166,6 @@ def test_loops_join_two_places_and_the_path_without_them_lies_below(drawn):
     assert line(axis, "before loops were closed") == pytest.approx(before[:, [2, 0], 3])
     labels = [one.get_label() for one in axis.lines]
     assert labels.index("before loops were closed") < labels.index("estimate")
-    assert "a loop closed" not in [
-        one.get_label() for one in drawn(path_along_x(), *wall())["from above"].lines
-    ]
+    labels = drawn(path_along_x(), *wall())["from above"].get_legend_handles_labels()[1]
+    never = {"a loop closed", "lost: only predicted", "reference", "a map begins, 95 % of where"}
+    assert not never & set(labels)

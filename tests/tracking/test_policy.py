@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 pytest.importorskip("cv2")
 
@@ -80,9 +80,14 @@ def test_a_lost_camera_needs_the_more_the_more_landmarks_have_something_that_loo
     assert agreeing(range(COUNT), range(least), lost=True).matched.sum() == 0
 
 
-def test_three_matches_agree_with_some_pose_and_a_fourth_is_a_check():
-    """However few landmarks are searched: a pose has six degrees of freedom, a pixel two."""
-    assert [more_than_chance(searched) for searched in (1, 4, 8)] == [4, 4, 4]
+@pytest.mark.parametrize("searched", [4, 8, 12, 50])
+def test_so_many_matches_are_not_there_by_chance(searched):
+    """One in twenty landmarks is found by chance, a frame is believed by chance once in 1000; and
+    three matches agree with some pose, of which a fourth is a check."""
+    least = more_than_chance(searched)
+    assert binom.sf(least - 1, searched, 0.05) < 1e-3
+    assert least == LEAST_MATCHES == 4 or binom.sf(least - 2, searched, 0.05) > 1e-3
+    assert searched > 8 or least == 4
 
 
 def test_where_a_linear_test_puts_out_most_of_what_moved_together_that_is_believed():

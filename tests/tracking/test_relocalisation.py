@@ -38,6 +38,7 @@ def interrupted(source, during, image):
 
 @pytest.mark.slow
 def test_after_black_frames_the_camera_is_back_in_its_map():
+    """A map that is given up too early, or a pose in it that is wrong."""
     source = synthetic_source(frames=70, seed=3)
     tracker = Tracker(source.calibration, SETTINGS)
     during = range(35, 60)
@@ -59,6 +60,7 @@ def test_after_black_frames_the_camera_is_back_in_its_map():
 
 @pytest.mark.slow
 def test_another_room_is_another_map_and_the_first_is_known_again():
+    """Places that are taken for one another."""
     source, other = (
         synthetic_source(frames=85, seed=3),
         list(synthetic_source(frames=85, seed=1003)),
@@ -84,13 +86,9 @@ def test_another_room_is_another_map_and_the_first_is_known_again():
         assert tracker.state.restarted().map.number == 2
 
 
-def source_frame(source):
-    """A frame of it."""
-    return next(iter(source))
-
-
 @pytest.mark.slow
 def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
+    """What a saved map lacks to be known again."""
     source = synthetic_source(frames=60, seed=4)
     frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
     tracked = [tracker.track(frame) for frame in frames[:40]]
@@ -112,6 +110,7 @@ def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
 
 @pytest.mark.slow
 def test_where_no_map_is_known_another_begins(tmp_path):
+    """A search without an end."""
     source, other = synthetic_source(frames=40, seed=4), synthetic_source(frames=12, seed=77)
     tracker = Tracker(source.calibration, SETTINGS)
     for frame in source:
@@ -127,7 +126,7 @@ def test_where_no_map_is_known_another_begins(tmp_path):
 def test_a_map_of_another_camera_is_refused(tmp_path):
     source = synthetic_source(frames=2, width=320, height=240)
     tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
-    tracker.track(source_frame(source))
+    tracker.track(next(iter(source)))
     tracker.save(tmp_path / "map.npz")
     wrong = replace(source.calibration, fx=source.calibration.fx * 1.1)
     with pytest.raises(
@@ -162,7 +161,7 @@ def test_a_pose_is_found_among_wrong_matches_and_none_among_wrong_ones_alone():
 def test_landmarks_are_known_by_their_looks():
     """In a picture that is moved; a picture of noise has none of them."""
     source = synthetic_source(frames=2, seed=5)
-    image = source_frame(source).image
+    image = next(iter(source)).image
     corners = cv2.goodFeaturesToTrack(image, 40, 0.01, 20)[:, 0].astype(float)
     landmarks = {
         2 * i: Landmark(i, Patch.take(image, corner), np.eye(4), corner)
