@@ -229,20 +229,6 @@ def texture(width=640, height=480, seed=4):
 WIDE = np.diag([50.0**2, 50.0**2])  # gate: 152 pixels to each side
 
 
-@pytest.mark.parametrize("away", [(120, 0), (44.5, -101.3), (2, 3)])
-def test_a_patch_far_from_its_prediction_is_found(away):
-    template = Patch.take(texture(), CENTRE + 150.3).warped(np.eye(2))
-    centre = CENTRE + 150.3 - away
-    match = match_patch(add_noise(texture(), np.random.default_rng(0), 3.0), template, centre, WIDE)
-    assert match is not None
-    np.testing.assert_allclose(match.pixel, CENTRE + 150.3, atol=0.1)
-    # The same place, outside of a narrower ellipse and of one cut short.
-    if np.linalg.norm(away) > 100:
-        for covariance, how in ((WIDE / 4, {}), (WIDE, {"max_radius": 90.0})):
-            narrower = match_patch(texture(), template, centre, covariance, **how)
-            assert narrower is None or np.linalg.norm(narrower.pixel - CENTRE - 150.3) > 10
-
-
 def test_an_ellipse_is_cut_at_a_quarter_of_the_width():
     template = Patch.take(texture(), CENTRE + 150).warped(np.eye(2))
     for away, found in ((158, True), (163, False)):
@@ -260,6 +246,9 @@ def test_the_wide_search_finds_what_the_whole_one_finds(monkeypatch):
     templates = np.array([Patch.take(first, place).warped(np.eye(2)) for place in places])
     given = templates, places + rng.uniform(-90, 90, (40, 2)), np.tile(WIDE, (40, 1, 1))
     wide = places_of(second, *given)
+    found = [(one[0].pixel, place) for one, place in zip(wide, places, strict=True) if one]
+    assert np.median([np.linalg.norm(pixel - place) for pixel, place in found]) < 0.1
+    assert len(found) > 30
     monkeypatch.setattr(matching, "_NARROW", np.inf)
     for (one, *_), (other,) in zip(wide, places_of(second, *given), strict=True):
         # The starts differ by the rounding of scores of single precision.
@@ -287,8 +276,7 @@ def test_of_a_texture_that_is_there_twice_in_a_wide_ellipse_both_places_are_told
 
 
 def test_likenesses_outside_of_a_wide_ellipse_do_not_count():
-    image = texture()
-    u, v = 321, 241
+    image, (u, v) = texture(), (321, 241)
     patch = image[v - 12 :, u - 12 :][:25, :25].copy()
     template = Patch.take(image, np.array([321.0, 241.0])).warped(np.eye(2))
     along = np.array([[2000.0, 1960.0], [1960.0, 2000.0]])

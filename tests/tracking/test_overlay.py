@@ -124,6 +124,11 @@ def test_the_legend_fits_its_width(width):
         assert np.any(np.abs(overlay[90:].astype(int) - colour).max(axis=2) < 60)
 
 
+def test_unknown_statuses_are_refused():
+    with pytest.raises(ValueError, match="unknown label 'seen'; known: matched, unmatched"):
+        draw([200.0, 60.0], np.eye(2), NOTHING, "seen")
+
+
 def with_words(**words):
     return draw_overlay(GREY, EMPTY, **words)
 

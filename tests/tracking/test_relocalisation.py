@@ -24,38 +24,10 @@ from jaxslam.tracking.tracker import Tracker
 SETTINGS = TrackerSettings(filter="world", wanted=50, lost_for=5)
 
 
-def trajectory_of(source):
-    """The truth, which a synthetic video has."""
-    assert source.reference is not None
-    return source.reference
-
-
 def interrupted(source, during, image):
     """The source's frames, with another picture in some."""
     for frame in source:
         yield replace(frame, image=image(frame)) if frame.index in during else frame
-
-
-@pytest.mark.slow
-def test_after_black_frames_the_camera_is_back_in_its_map():
-    """A map that is given up too early, or a pose in it that is wrong."""
-    source = synthetic_source(frames=70, seed=3)
-    tracker = Tracker(source.calibration, SETTINGS)
-    during = range(35, 60)
-    black = np.zeros((source.calibration.height, source.calibration.width), np.uint8)
-    tracked = [tracker.track(f) for f in interrupted(source, during, lambda frame: black)]
-    back = min(one.index for one in tracked[during.stop :] if not one.lost)
-    assert back <= during.stop + 2
-    assert [one.index for one in tracked if one.lost] == [*range(during.start, back)]
-    assert {one.map for one in tracked} == {0}
-    assert tracker.restarts == 0
-    seen = [one for one in tracked if not one.lost]
-    T = np.array([one.T_wc[:3, 3] for one in seen])
-    T_wc = trajectory_of(source).T_wc
-    truth = (T_wc[[one.index for one in seen], :3, 3] - T_wc[0, :3, 3]) @ T_wc[0, :3, :3]
-    scale = np.sum(T * truth) / np.sum(T * T)
-    away = np.linalg.norm(scale * T - truth, axis=1)
-    assert away[35:].max() < 3 * away[:35].max()
 
 
 @pytest.mark.slow
@@ -84,28 +56,6 @@ def test_another_room_is_another_map_and_the_first_is_known_again():
     # A map that comes next has a number of its own.
     with jax.enable_x64(True):
         assert tracker.state.restarted().map.number == 2
-
-
-@pytest.mark.slow
-def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
-    """What a saved map lacks to be known again."""
-    source = synthetic_source(frames=60, seed=4)
-    frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
-    tracked = [tracker.track(frame) for frame in frames[:40]]
-    tracker.save(tmp_path / "map.npz")
-    later = Tracker.localising(tmp_path / "map.npz", source.calibration)
-    black = np.zeros_like(frames[0].image)
-    first = later.step(black, 0.0)
-    assert first.lost
-    assert later.searching
-    found = [later.step(frame.image, 1 + k / 30) for k, frame in enumerate(frames[45:])]
-    assert found[0].relocalised
-    assert not any(one.lost for one in found)
-    assert {one.map for one in found} == {0}
-    tracked += [tracker.track(frame) for frame in frames[40:]]
-    apart = np.linalg.norm(found[-1].T_wc[:3, 3] - tracked[-1].T_wc[:3, 3])
-    assert apart < 4 * tracked[-1].camera.sigma_position
-    assert found[-1].camera.sigma_position < 3 * tracked[-1].camera.sigma_position
 
 
 @pytest.mark.slow

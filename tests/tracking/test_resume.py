@@ -96,11 +96,6 @@ def test_what_several_records_share_is_written_once_and_shared_again(video, tmp_
     again = Tracker.load(tmp_path / "t.npz").state
     assert again.seen is again.map is again.left[0]
     assert again.left[1].landmarks[2] is again.map.landmarks[2]
-    assert list(again.landmarks) == list(state.landmarks)
-    for one, other in zip(again.landmarks.values(), state.landmarks.values(), strict=True):
-        assert (one.number, one.success, one.unseen) == (other.number, other.success, other.unseen)
-        np.testing.assert_array_equal(one.patch.stored, other.patch.stored)
-        np.testing.assert_array_equal(one.looks, other.looks)
     sizes = [(tmp_path / name).stat().st_size for name in ("once.npz", "t.npz")]
     assert sizes[1] < 1.1 * sizes[0]
 

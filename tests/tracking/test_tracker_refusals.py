@@ -8,8 +8,6 @@ import pytest
 
 from jaxslam.io.tum import read_tum, write_tum
 from jaxslam.tracking.film import OverlayWriter
-from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.overlay import draw_overlay
 from jaxslam.tracking.pointcloud import read_ply, write_ply
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import render, room, synthetic_source
@@ -166,14 +164,6 @@ def begun_with_a_target(**settings):
     )
 
 
-def labelled(label):
-    nothing = np.zeros((1, 2))
-    seen = Observations(
-        np.zeros(1, int), nothing, np.eye(2)[None], nothing, np.zeros(1), np.array([label])
-    )
-    return draw_overlay(GREY, seen)
-
-
 GREY = np.zeros((240, 320), np.uint8)
 STILL = np.tile(np.eye(4), (60, 1, 1))
 OF_CALLS = [
@@ -184,7 +174,6 @@ OF_CALLS = [
     (lambda: synthetic_source(frames=0), "frames must be positive"),
     (lambda: synthetic_source(rate=0.0), "rate must be positive"),
     (forward, "closer than"),
-    (lambda: labelled("seen"), "unknown label 'seen'; known: matched, unmatched"),
     (
         lambda: TrackerSettings(calibration="maybe"),
         "unknown calibration 'maybe'; known: white, consider",
