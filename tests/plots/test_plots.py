@@ -212,9 +212,5 @@ def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
         plot_log_scale({**jaxslam.summarise(study), "scale_free": False}, ax=ax)
     with pytest.raises(ValueError, match=r"a study is summarised, .* not list"):
         jaxslam.summarise([study])  # ty: ignore[invalid-argument-type]
-    with pytest.raises(ValueError, match="a dict is accepted, as make_filters gives it"):
-        jaxslam.monte_carlo("matched", [*study.filters, None])  # ty: ignore[invalid-argument-type]
-    with pytest.raises(ValueError, match="unknown dtype 'float17'; known: float64, float32"):
-        jaxslam.cast(study.filters, "float17")
     with pytest.raises(ValueError, match="confidence must be between 0 and 1, not 95"):
         jaxslam.mean_band(3, 10, 95)

@@ -127,15 +127,13 @@ def published(row):
     name, rate, steps, landmarks, placement, velocity, *sigmas = row.split()
     velocity = tuple(map(float, velocity.split(",")))
     linear, angular = (2, 1) if len(velocity) == 3 else (3, 3)
-    pairs = list(zip(sigmas[::2], sigmas[1::2], strict=True))
-    names = ("acceleration_sigma", "velocity_sigma")[: len(pairs)]
-    of_noise = {
-        field: (float(first),) * linear + (float(second),) * angular
-        for field, (first, second) in zip(names, pairs, strict=True)
-    }
-    given = {"rate": float(rate), "steps": int(steps), "landmarks": int(landmarks)}
+    given: dict[str, Any] = {"rate": float(rate), "steps": int(steps), "landmarks": int(landmarks)}
     given |= {"name": name, "placement": placement, "velocity": velocity}
-    return name, given | of_noise | OTHERS.get(name, {})
+    pairs = zip(sigmas[::2], sigmas[1::2], strict=True)
+    fields = "acceleration_sigma", "velocity_sigma"
+    for field, (first, second) in zip(fields, pairs, strict=False):
+        given[field] = (float(first),) * linear + (float(second),) * angular
+    return name, given | OTHERS.get(name, {})
 
 
 def test_built_in_scenarios_hold_the_published_numbers_and_survive_a_toml_file(tmp_path):

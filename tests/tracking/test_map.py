@@ -10,8 +10,6 @@ pytest.importorskip("cv2")
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.observations import Status
-from jaxslam.tracking import map as upkeep
-from jaxslam.tracking import search as searching
 from jaxslam.tracking.estimator import Correction, Estimator, Predicted
 from jaxslam.tracking.landmarks import MEMORY, Landmark, Points
 from jaxslam.tracking.map import Map, TrackerState, failing, in_view, note_found, worst_first
@@ -188,37 +186,6 @@ def test_the_worst_known_and_longest_unseen_go_first(sigmas, unseen, missed, ord
     assert worst_first(landmarks, points, SETTINGS).tolist() == order
 
 
-SMALL = {"width": 320, "height": 240}
-
-
-def hiding(monkeypatch, hidden):
-    """Let landmarks of some numbers not be in front of the camera while `hidden` says so."""
-
-    def search(landmarks, prediction, *rest):
-        slots = [slot for slot, one in landmarks.items() if hidden(one.number)]
-        usable = prediction.usable & ~np.isin(np.arange(len(prediction.usable)), slots)
-        return to_search(landmarks, prediction._replace(usable=usable), *rest)
-
-    monkeypatch.setattr(searching, "to_search", search)
-
-
-@pytest.mark.slow
-def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
-    """A landmark whose place is forgotten while it is away for long."""
-    source = synthetic_source(frames=25, **SMALL)
-    there = [frame.image for frame in source]
-    settings = TrackerSettings(filter="robocentric", wanted=12, spare=20)
-    tracker = Tracker(source.calibration, settings)
-    away = range(4, 45)
-    hiding(monkeypatch, lambda number: number < 4 and index in away)
-    for index, image in enumerate([*there, *there[-2::-1]]):
-        tracker.step(image, index / 30)
-        unseen = {one.number: one.unseen for one in tracker.landmarks.values()}
-        if index == away[-1]:
-            assert [unseen[number] for number in range(4)] == [len(away)] * 4
-    assert [unseen[number] < 5 for number in range(4)] == [True] * 4
-
-
 class Broken(Estimator):
     """Its covariance is not positive, whatever it is given."""
 
@@ -247,33 +214,8 @@ def test_a_filter_that_is_begun_anew_in_metres_goes_on_in_the_unit_of_its_map():
     assert after.map.place.unit == pytest.approx(0.5)
 
 
-@pytest.mark.slow
-def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
-    """More landmarks than slots, which no short video has."""
-    source = synthetic_source(frames=12, **SMALL)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
-    hiding(monkeypatch, lambda number: number < 8)
-    kept, asked = [], []
-
-    def worst(landmarks, *rest):
-        asked.extend(landmarks)
-        assert all(one.unseen > 0 for one in landmarks)
-        return worst_first(landmarks, *rest)
-
-    monkeypatch.setattr(upkeep, "worst_first", worst)
-    for frame in source:
-        tracked = tracker.track(frame)
-        kept.append({one.number for one in tracker.landmarks.values()})
-    # Eight new ones in the place of eight that are not seen, of which four have slots.
-    assert sum(number < 8 for number in kept[1]) == 4
-    assert all(len(numbers) == 16 for numbers in kept[1:])
-    assert tracked.status.count("matched") >= 9
-    assert len(asked) >= 8
-    assert len(tracker.points().numbers) == tracker.created == 16 + tracker.deleted
-
-
 def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
-    source = synthetic_source(frames=14, **SMALL)
+    source = synthetic_source(frames=14, width=320, height=240)
     settings = TrackerSettings(filter="world", wanted=12, spare=4, spacing=8.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
@@ -285,3 +227,6 @@ def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
             before = found.sum()
     assert before < 10
     assert found.sum() >= 11
+    assert len(tracker.landmarks) <= settings.capacity
+    assert len(tracker.points().numbers) == tracker.created
+    assert tracker.created == len(tracker.landmarks) + tracker.deleted

@@ -200,17 +200,15 @@ def test_many_patches_at_once_equal_one_by_one():
     templates[3] = 7.0  # flat: never found
     centres[5] = np.nan
     covariances = np.einsum("n,ij->nij", rng.uniform(2, 9, 12), np.eye(2))
-    together = places_of(second, templates, centres, covariances)
-    together = [places[0] if places else None for places in together]
-    for index, match in enumerate(together):
-        alone = match_patch(second, templates[index], centres[index], covariances[index])
-        assert (match is None) == (alone is None)
-        if match is not None and alone is not None:
-            np.testing.assert_allclose(match.pixel, alone.pixel, atol=1e-4)
-            assert match.score == alone.score  # of one and the same call of OpenCV: exact
-    assert together[3] is None
-    assert together[5] is None
-    assert sum(match is not None for match in together) >= 8
+    together = match_patches(second, templates, centres, covariances)
+    for k in range(12):
+        one = slice(k, k + 1)
+        alone = match_patches(second, templates[one], centres[one], covariances[one])
+        np.testing.assert_allclose(together.pixels[together.owner == k], alone.pixels, atol=1e-4)
+        # Of one and the same call of OpenCV: exact.
+        np.testing.assert_array_equal(together.scores[together.owner == k], alone.scores)
+    assert set(together.owner) <= set(range(12)) - {3, 5}
+    assert len(set(together.owner)) >= 8
     none = match_patches(second, templates[:0], centres[:0], covariances[:0])
     assert [len(part) for part in none] == [0] * 4
     # In a wide ellipse nothing is found of what is flat, either.

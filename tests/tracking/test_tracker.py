@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import cv2
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,7 +21,6 @@ import jaxslam
 from jaxslam._runtime.programs import Program
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.evaluation import read_covariances
-from jaxslam.filters.readouts import landmarks_in_camera
 from jaxslam.io.opening import open_source
 from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
@@ -35,8 +33,8 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import describe
-from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.synthetic import add_noise, synthetic_source
+from jaxslam.tracking.tracker import MOST_REPEATS, Tracker
 from jaxslam.tracking.trajectory import absolute_trajectory_error
 from jaxslam.tracking.video import track
 
@@ -338,21 +336,91 @@ def test_a_jerk_that_all_matches_tell_of_is_believed(monkeypatch):
     assert tracker.track(last).lost
 
 
-def test_an_unknown_calibration_counts_in_the_first_frame_too():
-    """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
-    source = small(1)
-    settings = replace(SMALL, calibration="white", focal_sigma=1.0, centre_sigma=2.0)
-    tracker = Tracker(source.calibration, settings)
-    tracker.track(next(iter(source)))
-    slam, slots = tracker.estimator.slam, jnp.array(sorted(tracker.landmarks))
-    assert isinstance(slam, jaxslam.Slam)
-    charts, covariances = eqx.filter_jit(landmarks_in_camera)(
-        slam, tracker.map.state, slots, slam.sensor
-    )
-    # u = f x/z + c, each of f, c and u with its own σ.
-    variance = 0.3**2 + 2.0**2 + np.asarray(charts)[:, 0] ** 2
-    expected = variance / source.calibration.fx**2
-    np.testing.assert_allclose(covariances[:, 0, 0], expected, rtol=1e-6, atol=0)
+# --- pictures that say nothing ------------------------------------------------------------------
+
+
+def as_compressed(image, index):
+    """A copy in which some pixels are a grey level off."""
+    off = np.random.default_rng(index).random(image.shape) < 0.2
+    return np.where(off & (image < 255), image + 1, image).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def once():
+    """Frames, a tracker's results of them, and a new one."""
+    source = small(6)
+    tracker, frames = Tracker(source.calibration, SMALL), list(source)
+    return frames, [tracker.track(frame) for frame in frames], source.calibration
+
+
+def noisy(image, seed):
+    return add_noise(image, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("copied", [lambda image, _: image, as_compressed])
+def test_a_picture_that_comes_twice_is_used_once(once, copied):
+    frames, expected, calibration = once
+    tracker, results = Tracker(calibration, SMALL), []
+    for frame in frames:
+        results.append(tracker.track(replace(frame, index=2 * frame.index)))
+        results.append(tracker.step(copied(frame.image, frame.index), frame.time + 1 / 60))
+    assert [one.repeated for one in results] == [False, True] * 6
+    assert tracker.steps == 12
+    for used, copy, one in zip(results[::2], results[1::2], expected, strict=True):
+        assert not copy.lost
+        assert copy.nis_dof == 0
+        np.testing.assert_array_equal(copy.T_wc, used.T_wc)
+        np.testing.assert_array_equal(copy.covariance, used.covariance)
+        np.testing.assert_allclose(used.T_wc, one.T_wc, atol=1e-9)
+        np.testing.assert_allclose(used.covariance, one.covariance, atol=1e-9)
+
+
+def test_a_camera_that_stands_still_goes_on_from_there_at_once(once):
+    """After a long standstill the time that it took says nothing of how far it can be."""
+    (first, second, third, *_), _, calibration = once
+    tracker = Tracker(calibration, SMALL)
+    for frame in (first, second):
+        tracker.track(frame)
+    for k in range(40):
+        assert tracker.step(second.image, second.time + (k + 1) / 30).repeated
+    assert tracker.state.repeats == 40 > MOST_REPEATS
+    found = tracker.step(third.image, second.time + 41 / 30)
+    assert found.state == "tracked"
+    assert found.status.count("matched") > 8
+
+
+@pytest.mark.parametrize("flash", [False, True])
+def test_noise_alone_makes_another_picture(once, flash):
+    """After a flash, too: a tenth of what changed between darkness and a picture is more than a
+    slow camera changes."""
+    (first, *_), _, calibration = once
+    tracker = Tracker(calibration, SMALL)
+    for k in range(4):
+        image = noisy(first.image, k) * (not flash or k != 1)
+        assert not tracker.step(image.astype(np.uint8), k / 30).repeated
+
+
+def test_seconds_of_darkness_make_no_maps(once):
+    """Its noise has corners, none of which is found again; and the map before is still known."""
+    frames, _, calibration = once
+    tracker = Tracker(calibration, replace(SMALL, lost_for=2))
+    for frame in frames:
+        tracker.track(frame)
+    known, dark = tracker.map.landmarks.keys(), np.zeros_like(frames[0].image)
+    results = [tracker.step(noisy(dark, k), 1 + k / 30) for k in range(20)]
+    assert all(one.lost for one in results)
+    assert {one.map for one in results} == {0, 1}
+    assert sum(one.starts for one in results) == 1
+    assert not any(len(one.created) for one in results if one.map == 0)
+    assert tracker.restarts == 0
+    (before,) = tracker.state.left
+    assert (before.number, before.landmarks.keys()) == (0, known)
+
+
+def test_darkness_before_the_first_map_is_no_repeated_picture(once):
+    tracker = Tracker(once[2], SMALL)
+    results = [tracker.step(np.zeros((240, 320), np.uint8), k / 30) for k in range(3)]
+    assert [one.state for one in results] == ["start", "lost", "lost"]
 
 
 # --- slow: what only longer videos, other filters and real pictures show --------------------------
