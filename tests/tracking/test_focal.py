@@ -20,7 +20,7 @@ from jaxslam.tracking.report import Tracked
 CAMERA = Calibration(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.3, 0.1, 1e-3, -1e-3, 0.0))
 
 
-def video(seed=0, turn=0.15, move=1.0, frames=20, points=50):
+def video(seed=0, turn=0.15, move=1.0, frames=16, points=40):
     """Frames of a camera that moves and turns before points, seen with 0.2 pixels of noise."""
     draw = np.random.default_rng(seed)
     places = draw.uniform([-2, -1.5, 3], [2, 1.5, 9], (points, 3))
