@@ -351,7 +351,7 @@ def test_matched_truth_is_drawn_from_the_filters_prior_and_seen_with_the_stated_
         uniform(ideal[..., axis], low[axis], high[axis])
     assert np.asarray(runs.visible)[:, 0].all()
     least, mean, sigma = chosen.least_inverse_depth, 1 / 6, 1 / 12
-    assert w.min() > least
+    assert least < w.min() < 10 * least
     prior = stats.truncnorm((least - mean) / sigma, np.inf, mean, sigma)
     assert stats.kstest(w, prior.cdf).pvalue > FALSE_ALARM
 
@@ -407,6 +407,11 @@ def test_the_camera_circles_around_the_centre_of_the_ring():
     np.testing.assert_allclose(np.sum(-T[:, :2, 0] * to_centre, axis=1), 1.0, rtol=1e-5)
     angles = np.unwrap(np.sort(np.arctan2(*(points - centre).T)))
     np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 36, rtol=1e-9)
+    # In space it is on the left too, and on three levels.
+    world = scenario("laps-6dof")
+    points = np.asarray(world.placement.points(world, jax.random.key(0)))
+    np.testing.assert_allclose(points.mean(axis=0), [-4, 0, 0], atol=1e-9)
+    assert set(points[:, 1].tolist()) == {-1.0, 0.0, 1.0}
 
 
 @pytest.mark.parametrize("drawing", ["constant", "white"])

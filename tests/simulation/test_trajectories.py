@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import jaxslam
 from jaxslam.io.tum import poses
 from jaxslam.simulation import RecordedMotion, scenario, simulate, trajectory_of
-from jaxslam.simulation.trajectories import CUTOFF, GAP, find, sampled
+from jaxslam.simulation.trajectories import GAP, find, sampled
 
 FALSE_ALARM = 1e-6
 """Share of seeds on which a statistical test here would fail although nothing is wrong."""
@@ -67,8 +67,8 @@ def test_what_trembles_goes_and_what_moves_stays(tmp_path):
     times = np.arange(0, 8, 0.01)
     found = sampled(write(tmp_path / "a.txt", times, jitter=1e-3), 30.0, 45)
     error = matrices(found)[:, :3, 3] - path_at(np.arange(len(found.poses)) / 30)[0]
-    # A millimetre of 100 poses a second, of which what is below the cutoff stays.
-    assert np.sqrt(np.mean(error**2)) < 1.2e-3 * np.sqrt(CUTOFF / 50)
+    # A millimetre of 100 poses a second, of which what is below the cutoff of 6 Hz stays.
+    assert np.sqrt(np.mean(error**2)) < 1.2e-3 * np.sqrt(6 / 50)
 
 
 def test_signs_of_quaternions_and_repeated_times_do_not_matter(tmp_path):

@@ -71,7 +71,7 @@ def test_matches_of_one_motion_agree_by_any_lens(lens):
     before = pixels_of(lens, 60)
     X, _ = moved(rays(lens, before) * draw.uniform(1, 9, (60, 1)))
     now = sighted(lens, X).pixels + draw.normal(0, 0.2, (60, 2))
-    now[::4] += draw.choice([-1, 1], (15, 2)) * draw.uniform(15, 50, (15, 2))
+    now[::4] += draw.choice([-1, 1], (15, 2)) * draw.uniform(5, 12, (15, 2))
     agree = of_one_motion(before, now, lens, 0.45)
     near = on_pinhole(lens, before)[1] & on_pinhole(lens, now)[1]
     right = np.arange(60) % 4 > 0

@@ -377,7 +377,7 @@ def test_a_picture_that_comes_twice_is_used_once(once, copied):
 
 def test_a_camera_that_stands_still_goes_on_from_there_at_once(once):
     """After a long standstill the time that it took says nothing of how far it can be."""
-    (first, second, third, *_), _, calibration = once
+    (first, second, third, *_), (_, _, expected, *_), calibration = once
     tracker = Tracker(calibration, SMALL)
     for frame in (first, second):
         tracker.track(frame)
@@ -387,6 +387,8 @@ def test_a_camera_that_stands_still_goes_on_from_there_at_once(once):
     found = tracker.step(third.image, second.time + 41 / 30)
     assert found.state == "tracked"
     assert found.status.count("matched") > 8
+    sizes = [np.median(np.trace(x.observations.covariances, 0, 1, 2)) for x in (found, expected)]
+    assert sizes[0] < 2 * sizes[1]
 
 
 @pytest.mark.parametrize("flash", [False, True])
