@@ -137,10 +137,12 @@ class Estimator:
 
     def predict(self, state: Belief, control: Control, livelier: float = 1.0) -> Predicted:
         """Return what the filter expects after the motion of this control, as seconds, of a camera
-        whose accelerations have so many times their σ."""
+        whose accelerations have so many times their σ, where that is a field of the motion."""
         control = np.asarray(control) if isinstance(control, float) else control
         slam = self.slam
-        if livelier != 1.0 and isinstance(slam, AbstractSlam):
+        # One of one's own may compute it.
+        scalable = isinstance(slam, AbstractSlam) and "noise_sigma" in vars(slam.motion)
+        if livelier != 1.0 and scalable:
             sigma = livelier * slam.motion.noise_sigma
             slam = replace(slam, motion=replace(slam.motion, noise_sigma=sigma))
         (state, gaussian), joint, view = _predict(slam, state, control)

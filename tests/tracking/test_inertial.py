@@ -64,6 +64,7 @@ def test_a_film_from_other_times_than_its_readings_is_refused(short):
 
 @pytest.mark.slow
 def test_a_path_is_in_metres_from_rest_and_in_motion():
+    """The scale, and what is claimed of it, which only seconds of a film tell."""
     for rest in (REST, 0.0):
         of = film(12, rest, seconds=5.0)
         found = measured(of, replace(SMALL, wanted=30), imu=True, rest=rest)
@@ -130,6 +131,7 @@ def folder(short, tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_command_tracks_with_the_readings_of_a_folder(folder, tmp_path, capsys):
+    """The way of files and options into the filter, and of metres into the summary."""
     files = tuple(folder.parent / x for x in ("imu.yaml", "camchain-imucam.yaml"))
     TrackOptions(
         source=folder, imu=(), imu_calibration=files, out=tmp_path, overlay=False, wanted=20

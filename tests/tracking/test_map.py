@@ -10,8 +10,6 @@ pytest.importorskip("cv2")
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.observations import Status
-from jaxslam.tracking import map as upkeep
-from jaxslam.tracking import search as searching
 from jaxslam.tracking.estimator import Correction, Estimator, Predicted
 from jaxslam.tracking.landmarks import MEMORY, Landmark, Points
 from jaxslam.tracking.map import Map, TrackerState, failing, in_view, note_found, worst_first
@@ -32,6 +30,10 @@ def landmark(number, **counts):
     return Landmark(number, PATCH, np.eye(4), np.zeros(2), **counts)
 
 
+def pair(**counts):
+    return {3: landmark(0, **counts), 4: landmark(1, **counts)}
+
+
 def search(landmarks, found, times):
     slots, labels = np.array(list(landmarks), int), np.where(found, "matched", "unmatched")
     seen = Observations(slots, pixels=np.array([[7.0, 8.0]] * len(slots)), labels=labels)
@@ -44,16 +46,39 @@ def search(landmarks, found, times):
     ("before", "in_vain", "goes"), [(400, 15, True), (400, 5, False), (0, 9, False), (0, 12, True)]
 )
 def test_a_landmark_is_judged_by_its_latest_searches(before, in_vain, goes):
-    landmarks = {3: landmark(0), 4: landmark(1)}
-    landmarks = search(landmarks, [True, True], before)
-    landmarks = search(landmarks, [False, True], in_vain)
+    landmarks = search(search(pair(), [True, True], before), [False, True], in_vain)
     assert failing(landmarks, SETTINGS) == ([3] if goes else [])
 
 
-def test_a_landmark_at_the_least_success_is_kept():
+def test_a_landmark_that_is_found_often_enough_is_kept():
     least = SETTINGS.least_success
     landmarks = {3: landmark(0, success=least), 4: landmark(1, success=np.nextafter(least, 0))}
     assert failing(landmarks, SETTINGS) == [4]
+    landmarks = pair()
+    for _ in range(50):
+        landmarks = search(search(landmarks, [False, True], 1), [True, True], 1)
+    assert failing(landmarks, SETTINGS) == []
+    assert 0.4 < landmarks[3].success < 0.6
+
+
+def test_a_frame_in_which_nothing_is_found_is_held_against_none():
+    landmarks = search(pair(), [False, False], 40)
+    assert failing(landmarks, SETTINGS) == []
+    assert in_view(landmarks, [3, 4], SETTINGS).all()
+    assert [one.unseen for one in landmarks.values()] == [40, 40]
+
+
+def test_a_landmark_counts_as_in_view_until_it_was_missed_some_times():
+    absent = SETTINGS.absent_after
+    landmarks = search(pair(), [False, True], absent)
+    assert [one.seen_at.tolist() for one in landmarks.values()] == [[0.0, 0.0], [7.0, 8.0]]
+    assert in_view(landmarks, [4, 3, 9], SETTINGS).tolist() == [True, True, False]
+    landmarks = search(landmarks, [False, True], 1)
+    assert in_view(landmarks, [4, 3], SETTINGS).tolist() == [True, False]
+    assert (landmarks[3].missed, landmarks[3].unseen) == (absent + 1,) * 2
+    landmarks = search(landmarks, [True, True], 1)
+    assert in_view(landmarks, [4, 3], SETTINGS).all()
+    assert (landmarks[3].missed, landmarks[3].unseen) == (0, 0)
 
 
 def test_a_landmark_that_slides_is_less_sure_and_one_that_stays_is_not():
@@ -76,41 +101,6 @@ def test_a_noise_factor_is_of_all_that_a_match_is_used_for():
     for factors in ([1.0, 1.0], [4.0, 2.5]):
         more = SETTINGS.noise_factors(SETTINGS.noisier(variances, np.array(factors)))
         np.testing.assert_allclose(more, SETTINGS.noise_factors(variances) * factors)
-
-
-def test_where_a_landmark_was_found_last_is_noted():
-    landmarks = search({3: landmark(0), 4: landmark(1)}, [True, False], 1)
-    assert [one.seen_at.tolist() for one in landmarks.values()] == [[7.0, 8.0], [0.0, 0.0]]
-    assert [one.unseen for one in landmarks.values()] == [0, 1]
-
-
-def test_one_found_every_other_time_is_kept():
-    landmarks = {3: landmark(0), 4: landmark(1)}
-    for _ in range(50):
-        landmarks = search(landmarks, [False, True], 1)
-        landmarks = search(landmarks, [True, True], 1)
-    assert failing(landmarks, SETTINGS) == []
-    assert 0.4 < landmarks[3].success < 0.6
-
-
-def test_a_frame_in_which_nothing_is_found_is_held_against_none():
-    landmarks = {3: landmark(0), 4: landmark(1)}
-    landmarks = search(landmarks, [False, False], 40)
-    assert failing(landmarks, SETTINGS) == []
-    assert in_view(landmarks, [3, 4], SETTINGS).all()
-    assert [one.unseen for one in landmarks.values()] == [40, 40]
-
-
-def test_a_landmark_counts_as_in_view_until_it_was_missed_some_times():
-    landmarks = {3: landmark(0), 4: landmark(1)}
-    landmarks = search(landmarks, [False, True], SETTINGS.absent_after)
-    assert in_view(landmarks, [4, 3, 9], SETTINGS).tolist() == [True, True, False]
-    landmarks = search(landmarks, [False, True], 1)
-    assert in_view(landmarks, [4, 3], SETTINGS).tolist() == [True, False]
-    assert (landmarks[3].missed, landmarks[3].unseen) == (SETTINGS.absent_after + 1,) * 2
-    landmarks = search(landmarks, [True, True], 1)
-    assert in_view(landmarks, [4, 3], SETTINGS).all()
-    assert (landmarks[3].missed, landmarks[3].unseen) == (0, 0)
 
 
 def predicted(points, position=(0.0, 0.0, 0.0), omega=1.0):
@@ -174,61 +164,26 @@ def test_what_is_at_infinity_looks_the_same_from_anywhere():
     np.testing.assert_allclose(affines[0], np.eye(2), atol=1e-12)
 
 
-def test_the_worst_known_and_longest_unseen_go_first():
-    sigmas = np.array([0.1, 0.1, 5.0, np.nan, 0.1, 0.2])
-    unseen = [100, 300, 40, 20, 8, 100]
-    missed = [0, 0, 0, 2, 6, 0]
-    landmarks = [
-        landmark(i, unseen=u, missed=m) for i, (u, m) in enumerate(zip(unseen, missed, strict=True))
-    ]
-    covariances = sigmas[:, None, None] ** 2 * np.eye(3) / 3
-    places = np.tile([0.0, 0.0, 2.0], (6, 1))
-    points = Points(
-        np.arange(6), np.zeros(6, int), np.zeros(6, int), places, covariances, covariances
-    )
-    assert worst_first(landmarks, points, SETTINGS).tolist() == [4, 2, 3, 1, 5, 0]
-
-
-def test_a_depth_that_is_hardly_known_is_worth_as_little_as_one_that_is_not_known():
-    """σ of 2.5 distances, unseen for 40 frames, and of no known depth for 60."""
-    absent = SETTINGS.absent_after + 1
-    landmarks = [landmark(0, unseen=40, missed=absent), landmark(1, unseen=60, missed=absent)]
-    covariances = np.array([5.0, np.nan])[:, None, None] ** 2 * np.eye(3) / 3
-    places = np.tile([0.0, 0.0, 2.0], (2, 1))
-    points = Points(
-        np.arange(2), np.zeros(2, int), np.zeros(2, int), places, covariances, covariances
-    )
-    assert worst_first(landmarks, points, SETTINGS).tolist() == [1, 0]
-
-
-SMALL = {"width": 320, "height": 240}
-
-
-def hiding(monkeypatch, hidden):
-    """Let landmarks of some numbers not be in front of the camera while `hidden` says so."""
-
-    def search(landmarks, prediction, *rest):
-        slots = [slot for slot, one in landmarks.items() if hidden(one.number)]
-        usable = prediction.usable & ~np.isin(np.arange(len(prediction.usable)), slots)
-        return to_search(landmarks, prediction._replace(usable=usable), *rest)
-
-    monkeypatch.setattr(searching, "to_search", search)
-
-
-@pytest.mark.slow
-def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
-    source = synthetic_source(frames=25, **SMALL)
-    there = [frame.image for frame in source]
-    settings = TrackerSettings(filter="robocentric", wanted=12, spare=20)
-    tracker = Tracker(source.calibration, settings)
-    away = range(4, 45)
-    hiding(monkeypatch, lambda number: number < 4 and index in away)
-    for index, image in enumerate([*there, *there[-2::-1]]):
-        tracker.step(image, index / 30)
-        unseen = {one.number: one.unseen for one in tracker.landmarks.values()}
-        if index == away[-1]:
-            assert [unseen[number] for number in range(4)] == [len(away)] * 4
-    assert [unseen[number] < 5 for number in range(4)] == [True] * 4
+@pytest.mark.parametrize(
+    ("sigmas", "unseen", "missed", "order"),
+    [
+        (
+            [0.1, 0.1, 5.0, np.nan, 0.1, 0.2],
+            [100, 300, 40, 20, 8, 100],
+            [0, 0, 0, 2, 6, 0],
+            [4, 2, 3, 1, 5, 0],
+        ),
+        # σ of 2.5 distances is worth as little as no known depth.
+        ([5.0, np.nan], [40, 60], [SETTINGS.absent_after + 1] * 2, [1, 0]),
+    ],
+)
+def test_the_worst_known_and_longest_unseen_go_first(sigmas, unseen, missed, order):
+    count = len(sigmas)
+    landmarks = [landmark(i, unseen=unseen[i], missed=missed[i]) for i in range(count)]
+    covariances = np.array(sigmas)[:, None, None] ** 2 * np.eye(3) / 3
+    nothing, places = np.zeros(count, int), np.tile([0.0, 0.0, 2.0], (count, 1))
+    points = Points(np.arange(count), nothing, nothing, places, covariances, covariances)
+    assert worst_first(landmarks, points, SETTINGS).tolist() == order
 
 
 class Broken(Estimator):
@@ -259,32 +214,8 @@ def test_a_filter_that_is_begun_anew_in_metres_goes_on_in_the_unit_of_its_map():
     assert after.map.place.unit == pytest.approx(0.5)
 
 
-@pytest.mark.slow
-def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
-    source = synthetic_source(frames=12, **SMALL)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
-    hiding(monkeypatch, lambda number: number < 8)
-    kept, asked = [], []
-
-    def worst(landmarks, *rest):
-        asked.extend(landmarks)
-        assert all(one.unseen > 0 for one in landmarks)
-        return worst_first(landmarks, *rest)
-
-    monkeypatch.setattr(upkeep, "worst_first", worst)
-    for frame in source:
-        tracked = tracker.track(frame)
-        kept.append({one.number for one in tracker.landmarks.values()})
-    # Eight new ones in the place of eight that are not seen, of which four have slots.
-    assert sum(number < 8 for number in kept[1]) == 4
-    assert all(len(numbers) == 16 for numbers in kept[1:])
-    assert tracked.status.count("matched") >= 9
-    assert len(asked) >= 8
-    assert len(tracker.points().numbers) == tracker.created == 16 + tracker.deleted
-
-
 def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
-    source = synthetic_source(frames=14, **SMALL)
+    source = synthetic_source(frames=14, width=320, height=240)
     settings = TrackerSettings(filter="world", wanted=12, spare=4, spacing=8.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
@@ -296,3 +227,6 @@ def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
             before = found.sum()
     assert before < 10
     assert found.sum() >= 11
+    assert len(tracker.landmarks) <= settings.capacity
+    assert len(tracker.points().numbers) == tracker.created
+    assert tracker.created == len(tracker.landmarks) + tracker.deleted

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from cases import quick_rows
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb
 
@@ -13,15 +12,9 @@ from jaxslam.plots.style import COLOURS
 from jaxslam.plots.tracking import plot_map
 
 
-@pytest.fixture
-def drawn():
-    """What draws a map, and returns its axes by title."""
-
-    def draw(*data, **more):
-        figure = plot_map(*data, **more)
-        return {axis.get_title().split(":")[0]: axis for axis in figure.axes}
-
-    return draw
+def drawn(*data, **more):
+    """The axes of the figure of a map, by title."""
+    return {axis.get_title().split(":")[0]: axis for axis in plot_map(*data, **more).axes}
 
 
 def path_along_x(n=30, length=1.0):
@@ -39,7 +32,7 @@ def line(axis, label):
     return found.get_xydata()
 
 
-def test_the_estimate_is_interrupted_where_it_was_only_predicted(drawn):
+def test_the_estimate_is_interrupted_where_it_was_only_predicted():
     lost = np.zeros(30, bool)
     lost[10:13] = True
     axis = drawn(path_along_x(), *wall(), lost=lost)["from above"]
@@ -50,13 +43,7 @@ def test_the_estimate_is_interrupted_where_it_was_only_predicted(drawn):
     assert np.flatnonzero(predicted).tolist() == [9, 10, 11, 12, 13]
 
 
-def test_nothing_lost_and_no_reference_are_not_in_the_legend(drawn):
-    axis = drawn(path_along_x(), *wall())["from above"]
-    labels = axis.get_legend_handles_labels()[1]
-    assert not {"lost: only predicted", "reference", "a map begins, 95 % of where"} & set(labels)
-
-
-def test_the_line_breaks_where_a_map_begins(drawn):
+def test_the_line_breaks_where_a_map_begins():
     covariance = np.diag([0.01, 0.02, 0.04])
     given = dict(begun=[10], begun_covariances=[covariance])
     axis = drawn(path_along_x(), *wall(), **given)["from above"]
@@ -70,7 +57,7 @@ def test_the_line_breaks_where_a_map_begins(drawn):
     np.testing.assert_allclose(sizes, [[2 * np.sqrt(5.991 * 0.04)], [2 * np.sqrt(5.991 * 0.01)]])
 
 
-def test_ticks_point_where_the_camera_looks(drawn):
+def test_ticks_point_where_the_camera_looks():
     turned = path_along_x()
     turned[:, :3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # along x
     axis = drawn(turned, *wall(width=9.0))["from above"]
@@ -82,7 +69,7 @@ def test_ticks_point_where_the_camera_looks(drawn):
     np.testing.assert_allclose(starts, turned[::2][:, [0, 2], 3], atol=1e-12)
 
 
-def test_the_reference_is_drawn_as_it_is_given(drawn):
+def test_the_reference_is_drawn_as_it_is_given():
     reference = path_along_x() + 0.0
     reference[:, 1, 3] = 0.3
     axis = drawn(path_along_x(), *wall(width=9.0), reference=reference)["from behind"]
@@ -93,7 +80,7 @@ def test_the_reference_is_drawn_as_it_is_given(drawn):
     ("width", "titles"),
     [(9.0, ["from above", "from behind"]), (1.0, ["from above", "from the side"])],
 )
-def test_what_is_longer_lies_to_the_right_in_equal_axes(drawn, width, titles):
+def test_what_is_longer_lies_to_the_right_in_equal_axes(width, titles):
     axes = drawn(path_along_x(length=5.0 if width > 4 else 2.5), *wall(width=width), unit="m")
     assert list(axes) == titles
     above, upright = axes.values()
@@ -106,7 +93,7 @@ def test_what_is_longer_lies_to_the_right_in_equal_axes(drawn, width, titles):
     assert above.yaxis_inverted() == (width < 4)
 
 
-def test_a_path_that_is_small_in_its_map_is_shown_alone_too(drawn):
+def test_a_path_that_is_small_in_its_map_is_shown_alone_too():
     axes = drawn(path_along_x(length=0.2), *wall())
     assert list(axes) == ["the path, from above", "from above", "from the side"]
     low, high = axes["the path, from above"].get_ylim()[::-1]
@@ -115,7 +102,7 @@ def test_a_path_that_is_small_in_its_map_is_shown_alone_too(drawn):
     assert high > 4
 
 
-def test_titles_count_what_is_not_shown(drawn):
+def test_titles_count_what_is_not_shown():
     points, covariances = wall()
     points[0] = (0, 0, 1e6)
     covariances[1] = 1e3 * np.eye(3)
@@ -124,7 +111,7 @@ def test_titles_count_what_is_not_shown(drawn):
     assert title == "from above: 39 landmarks, 1 more outside, 1 without ellipse"
 
 
-def test_a_camera_that_stands_still_without_landmarks_is_drawn(drawn):
+def test_a_camera_that_stands_still_without_landmarks_is_drawn():
     still = np.tile(np.eye(4), (5, 1, 1))
     axes = drawn(still, np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert list(axes) == ["from above", "from behind"]
@@ -139,7 +126,7 @@ def landmarks_of(axis):
     return [c.get_widths() for c in own if len(c.get_widths())]
 
 
-def test_landmarks_have_their_ellipses_in_the_figure_and_in_its_file(drawn, tmp_path):
+def test_landmarks_have_their_ellipses_in_the_figure_and_in_its_file(tmp_path):
     points, covariances = wall()
     covariances *= np.arange(1, 41)[:, None, None]
     axis = drawn(path_along_x(length=3.0), points, covariances, path=tmp_path / "map.png")
@@ -149,10 +136,8 @@ def test_landmarks_have_their_ellipses_in_the_figure_and_in_its_file(drawn, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
 
 
-@pytest.mark.parametrize(
-    ("length", "width"), quick_rows(2, [(100.0, 20.0), (0.2, 1.0), (3.0, 1.0), (5.0, 9.0)])
-)
-def test_titles_labels_and_legend_have_room(drawn, length, width):
+@pytest.mark.parametrize(("length", "width"), [(100.0, 20.0), (0.2, 1.0)])
+def test_titles_labels_and_legend_have_room(length, width):
     """None is cut off or drawn over another."""
     figure = drawn(
         path_along_x(length=length), *wall(width=width),
@@ -167,7 +152,7 @@ def test_titles_labels_and_legend_have_room(drawn, length, width):
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
-def test_loops_join_two_places_and_the_path_without_them_lies_below(drawn):
+def test_loops_join_two_places_and_the_path_without_them_lies_below():
     before = path_along_x(length=1.2)
     ends = np.array([[[0.9, 0.0, 0.0], [0.1, 0.0, 0.0]], [[1.0, 0.0, 0.0], [0.2, 0.0, 0.0]]])
     axis = drawn(path_along_x(), *wall(), loops=ends, before=before)["from above"]
@@ -175,6 +160,6 @@ def test_loops_join_two_places_and_the_path_without_them_lies_below(drawn):
     assert line(axis, "before loops were closed") == pytest.approx(before[:, [2, 0], 3])
     labels = [one.get_label() for one in axis.lines]
     assert labels.index("before loops were closed") < labels.index("estimate")
-    assert "a loop closed" not in [
-        one.get_label() for one in drawn(path_along_x(), *wall())["from above"].lines
-    ]
+    labels = drawn(path_along_x(), *wall())["from above"].get_legend_handles_labels()[1]
+    never = {"a loop closed", "lost: only predicted", "reference", "a map begins, 95 % of where"}
+    assert not never & set(labels)

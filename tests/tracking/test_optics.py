@@ -1,5 +1,7 @@
 """Rays, pixels and slopes of any lens, and what the tracker makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -64,17 +66,21 @@ def test_a_pinhole_picture_is_what_opencv_distorts(lens):
 
 @each_lens
 def test_matches_of_one_motion_agree_by_any_lens(lens):
+    """The same every time; of five matches or fewer nothing is said."""
     draw = np.random.default_rng(1)
     before = pixels_of(lens, 60)
     X, _ = moved(rays(lens, before) * draw.uniform(1, 9, (60, 1)))
     now = sighted(lens, X).pixels + draw.normal(0, 0.2, (60, 2))
-    now[::4] += draw.choice([-1, 1], (15, 2)) * draw.uniform(15, 50, (15, 2))
+    now[::4] += draw.choice([-1, 1], (15, 2)) * draw.uniform(5, 12, (15, 2))
     agree = of_one_motion(before, now, lens, 0.45)
     near = on_pinhole(lens, before)[1] & on_pinhole(lens, now)[1]
     right = np.arange(60) % 4 > 0
     assert agree[right & near].mean() > 0.85
     assert agree[~right].mean() < 0.25
     assert not agree[~near].any()
+    np.testing.assert_array_equal(of_one_motion(before, now, lens, 0.45), agree)
+    for count in (0, 3, 5):
+        assert not of_one_motion(before[:count], now[:count], lens, 0.45).any()
 
 
 @each_lens
@@ -114,9 +120,41 @@ def test_a_patch_changes_as_the_pixels_around_it_do(lens):
     np.testing.assert_allclose(affine, np.stack(steps, 2), rtol=0, atol=1e-4)
 
 
+# --- the map laid over a picture ------------------------------------------------------------------
+
+LENS = Calibration(320, 240, 300.0, 310.0, 160.0, 118.0, (-0.2, 0.05, 1e-3, -2e-3))
+
+
+def test_the_spread_in_the_picture_is_that_of_drawn_landmarks():
+    T_wc, point = np.eye(4), np.array([[0.2, 0.3, 4.0]])
+    T_wc[:3, :3] = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    T_wc[:3, 3] = [0.3, -0.1, 0.2]
+    A = np.random.default_rng(0).normal(size=(3, 3)) / 100
+    drawn = point + np.random.default_rng(1).normal(size=(20000, 3)) @ A.T
+    pixels, covariances = seen_from(T_wc, point, (A @ A.T)[None], LENS)
+    strided = np.column_stack([drawn, drawn])[:, :3]  # part of a table
+    cloud, _ = seen_from(T_wc, strided, np.zeros((20000, 3, 3)), LENS)
+    np.testing.assert_allclose(cloud.mean(axis=0), pixels[0], atol=0.05)
+    np.testing.assert_allclose(np.cov(cloud.T), covariances[0], rtol=0.05, atol=0.01)
+
+
+@pytest.mark.parametrize("point", [[0.0, 0.0, -4.0], [9.0, 0.0, 4.0]])
+def test_what_is_not_in_the_picture_has_no_pixel(point):
+    for others in ([], [[0.0, 0.0, 4.0]]):
+        points = np.array([point, *others])
+        pixels, spread = seen_from(np.eye(4), points, np.zeros((len(points), 3, 3)), LENS)
+        assert np.isnan(pixels[0]).all()
+        assert np.isnan(spread[0]).all()
+        assert np.isfinite(pixels[1:]).all()
+
+
 def test_a_fisheye_lays_a_map_over_its_picture_beyond_a_right_angle():
     points = np.array([[1.5, 1.5, -0.3], [0.1, 0.2, 3.0], [0.0, 0.01, -3.0]])
     pixels, spread = seen_from(np.eye(4), points, np.tile(np.eye(3) / 1e4, (3, 1, 1)), FISHEYE)
     assert np.hypot(*(pixels[0] - 255.5)) > 163 * np.pi / 2
     assert (np.linalg.eigvalsh(spread[:2]) > 0).all()
     assert np.isnan(pixels[2]).all()
+    # A lens without distortion is a pinhole.
+    ideal = replace(LENS, distortion=())
+    pixels, _ = seen_from(np.eye(4), np.array([[0.5, -0.2, 4.0]]), np.zeros((1, 3, 3)), ideal)
+    np.testing.assert_allclose(pixels, [[160 + 300 / 8, 118 - 310 / 20]])

@@ -1,4 +1,4 @@
-"""What a tracker makes of the calibration that it is given."""
+"""What a tracker makes of the calibration that it is given, and what it says of it."""
 
 import numpy as np
 import pytest
@@ -6,15 +6,16 @@ import pytest
 from jaxslam._runtime.programs import _Call, exactly
 from jaxslam.io.calibration import LENS_SIGMA, Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
+from jaxslam.tracking import summary
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.summary import _calibration
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
 STATED = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0, sigma=(4.0, 3.0, 2.0, 1.0))
 PLAIN = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0)
 GUESSED = from_field_of_view(640, 480)
+NO_POINTS = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
 
 
 @pytest.mark.parametrize(
@@ -22,10 +23,8 @@ GUESSED = from_field_of_view(640, 480)
     [
         (None, PLAIN, Estimated, (1.5, 0.96, 0.96)),
         (None, STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
-        ("known", STATED, Known, ()),
         (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
         ("known", GUESSED, Known, ()),
-        ("estimated", STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
         ("white", PLAIN, White, (0.7, 0.7, 0.6, 0.6)),
         ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8, *LENS_SIGMA)),
     ],
@@ -35,10 +34,12 @@ def test_a_calibration_is_estimated_and_stated_sigmas_are_used(name, calibration
     treatment = settings.treatment(calibration)
     assert type(treatment) is kind
     np.testing.assert_allclose(treatment.sigma, sigma, rtol=1e-12)
+    assert TrackerSettings(filter="recommended") == TrackerSettings()
 
 
 @pytest.mark.slow
 def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
+    """A lens that is not estimated, or in another direction."""
     source = synthetic_source(frames=45, width=320, height=240)
     true = source.calibration.fx
     guess = from_field_of_view(320, 240, 70.0)
@@ -74,20 +75,31 @@ def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_without_sig
     assert guesses != given
 
 
-def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
-    settings = TrackerSettings(filter="world", wanted=10, calibration="consider")
-    nothing = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
-    told = _calibration(Tracker(GUESSED, settings), [], nothing)
-    assert (told["treatment"], told["estimated"]["fx"]) == ("consider", GUESSED.fx)
-    assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
-    assert "caveat" not in told
+def of_camera(calibration, treatment):
+    settings = TrackerSettings(filter="world", wanted=10, calibration=treatment)
+    return Tracker(calibration, settings)
+
+
+def test_an_estimated_or_considered_lens_is_told_with_its_sigma(monkeypatch):
+    """Of one that was guessed no better one is looked for."""
+    monkeypatch.setattr(summary, "better_lens", None)
+    for treatment in ("consider", "estimated"):
+        tracker = of_camera(GUESSED, treatment)
+        told = summary._calibration(tracker, [], NO_POINTS)
+        assert (told["treatment"], told["estimated"]["fx"]) == (treatment, GUESSED.fx)
+        assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
+        assert told.get("caveat", "") == summary.caveat_of(tracker)
+        assert bool(summary.caveat_of(tracker)) == (treatment == "estimated")
+    lens = summary._lens(tracker)
+    assert list(lens) == ["fx", "fy", "cx", "cy", "k1", "k2"]
+    assert lens["k1"] == {"value": 0.0, "sigma": pytest.approx(0.15)}
 
 
 def test_a_known_camera_is_reported_as_it_is():
-    settings = TrackerSettings(filter="world", wanted=10, calibration="known")
-    tracker = Tracker(PLAIN, settings)
+    tracker = of_camera(PLAIN, "known")
     camera = tracker.camera()
     assert camera is not None
     assert camera[0] == "known"
     np.testing.assert_array_equal(camera[1], [500.0, 500.0, 320.0, 240.0])
     np.testing.assert_array_equal(camera[2], 0.0)
+    assert summary._lens(tracker) == {}

@@ -1,38 +1,201 @@
-"""What `track` writes: which files, in which order, whatever goes wrong on the way."""
+"""What `track` writes, whatever goes wrong on the way, and what it says."""
 
+import csv
 import json
+import resource
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import cv2
+import jax
 import numpy as np
 import pytest
-import tqdm.auto
 
 pytest.importorskip("cv2")
 
-import cv2
-
+from jaxslam._runtime.files import append_whole
 from jaxslam.cli.track import TrackOptions
-from jaxslam.io.calibration import from_field_of_view
-from jaxslam.tracking import overlay, summary
+from jaxslam.io.tum import read_tum
+from jaxslam.tracking import estimator as programs
+from jaxslam.tracking import overlay, report, summary
 from jaxslam.tracking import video as tracking
 from jaxslam.tracking.focal import BetterLens
-from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.places.smoothing import smoothed
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
-NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json", "map.npz"}
-FIGURES = {"map.ply", "map.png"}
+TEXTS = {"trajectory.txt", "frames.csv"}
+NUMBERS = TEXTS | {"covariance.txt", "map.npz"}
+ALL = NUMBERS | {"summary.json", "map.ply", "map.png"}
 
 
 def small(frames):
     return synthetic_source(frames=frames, width=160, height=120)
 
 
+def tracked(source, out, **how):
+    return tracking.track(source, out, SETTINGS, overlay=False, **how)
+
+
 def names(folder):
     return {path.name for path in folder.iterdir()}
+
+
+def rows_of(out):
+    with (out / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def frames_in(out):
+    """How many frames the trajectory and the table have."""
+    count = len(rows_of(out))
+    assert len(read_tum(out / "trajectory.txt")[0]) == count
+    return count
+
+
+def fail(*_, **__):
+    raise np.linalg.LinAlgError("no such numbers")
+
+
+# --- what is there, whatever ends it --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "left", "frames"),
+    [
+        (tracking, "plot_map", ALL - {"map.png"}, 3),
+        (overlay, "draw_overlay", ALL, None),  # as many as were tracked until it was noticed
+        (tracking.Aside, "give", ALL, 1),
+        (Tracker, "smoothed", ALL, 3),
+        (tracking, "summarised", NUMBERS, 3),
+    ],
+)
+def test_what_fails_ends_the_run_and_leaves_the_files_before_it(
+    owner, name, left, frames, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(owner, name, fail)
+    with pytest.raises(np.linalg.LinAlgError, match="no such numbers"):
+        tracking.track(small(3), tmp_path, SETTINGS)
+    assert names(tmp_path) - {"overlay.mp4"} == left
+    assert frames_in(tmp_path) == (frames or frames_in(tmp_path))
+    if "summary.json" in left:
+        told = json.loads((tmp_path / "summary.json").read_text())
+        assert told["frames"] == frames_in(tmp_path)
+
+
+@pytest.mark.parametrize("after", [1, 3])
+def test_an_interruption_leaves_the_files_of_the_frames_so_far(after, tmp_path, monkeypatch):
+    """That of the start waits for no program."""
+    counts = []
+
+    def look(_):
+        if names(tmp_path):
+            assert names(tmp_path) == TEXTS
+            counts.append(frames_in(tmp_path))
+        if len(counts) == after - 1:
+            raise KeyboardInterrupt
+
+    if after == 1:
+        monkeypatch.setattr(tracking, "_write", fail)
+    told = "has the files of the 3 frames" if after > 1 else None
+    with pytest.raises(KeyboardInterrupt, match=told):
+        tracked(small(20), tmp_path, progress=look)
+    assert counts == list(range(2, after + 1))
+    assert names(tmp_path) == (ALL if after > 1 else set())
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from jaxslam.tracking import video
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.synthetic import synthetic_source
+assert "rerun" not in sys.modules  # which only a recording needs
+
+class Still:
+    def __init__(self, *_):
+        self.seen = 0
+    def track(self, frame):
+        self.seen += 1
+        if self.seen == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Tracked(frame.index, frame.time, PoseWithCovariance())
+
+video.Tracker = Still
+video.track(synthetic_source(9, width=160, height=120), Path(sys.argv[1]), overlay=False)
+"""
+
+
+def test_a_process_that_is_killed_leaves_what_was_tracked_before(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], cwd=Path.cwd())
+    assert ended.returncode == -signal.SIGKILL
+    assert frames_in(tmp_path) == 4
+
+
+def test_a_line_for_which_there_is_no_room_is_not_begun(tmp_path):
+    path, (soft, hard) = tmp_path / "t.txt", resource.getrlimit(resource.RLIMIT_FSIZE)
+    append_whole(path, "a" * 59 + "\n")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.raises(OSError, match="No space left"):
+            append_whole(path, "b" * 59 + "\n")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_text() == "a" * 59 + "\n"
+
+
+@pytest.mark.parametrize(("name", "until"), [("_correct", 1), ("_correct", 99), ("_predict", 99)])
+def test_a_pose_that_is_not_finite_is_a_lost_frame_and_the_run_goes_on(
+    name, until, tmp_path, monkeypatch
+):
+    """From frame 3 on the filter's steps make no numbers, once or for ever."""
+    whole, broken, frames = getattr(programs, name), 0, 0
+
+    def step(*arguments):
+        nonlocal broken
+        made = whole(*arguments)
+        if frames < 3 or broken >= until:
+            return made
+        broken += 1
+        return jax.tree.map(lambda x: x * np.nan if x.dtype == float else x, made)
+
+    def count(more):
+        nonlocal frames
+        frames += more
+
+    monkeypatch.setattr(programs, name, step)
+    written = tracked(small(6), tmp_path, progress=count)
+    assert frames_in(tmp_path) == 6
+    reasons = [row["reason"] for row in rows_of(tmp_path)]
+    assert reasons[:4] == ["", "", "", "not finite"]
+    assert (reasons[4:] == ["", ""]) == (until == 1)
+    assert written["failed_updates"]["not_finite"] == reasons.count("not finite")
+    assert "1 not finite" in summary.describe(written) or until > 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_map_that_cannot_be_smoothed_stays_as_it_was_tracked():
+    """Submaps and loops can leave an information matrix that is singular."""
+    solved = SimpleNamespace(T_bc=np.full((2, 4, 4), np.nan), covariances=np.zeros((2, 6, 6)))
+    map = SimpleNamespace(number=3, submaps=("one",), graph=lambda *_: graph)
+    graph = SimpleNamespace(solved=lambda: solved)
+    estimator = SimpleNamespace(settings=None, slam=None)
+    points, history = object(), [report.Tracked(0, 0.0, PoseWithCovariance())]
+    state: Any = SimpleNamespace(map=map, estimator=estimator, known=list, points=lambda: points)
+    with pytest.warns(UserWarning, match="map 3 cannot be smoothed"):
+        assert smoothed(state, history) == (history, points)
+
+
+# --- what the summary says ------------------------------------------------------------------------
 
 
 def length(T_wc):
@@ -40,52 +203,20 @@ def length(T_wc):
     return np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1).sum()
 
 
-def fail(*_, **__):
-    raise ValueError("cannot draw")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "in_doubt"), [("scale_gauge+mixture3", True), ("world", False)])
-def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
-    tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)
-    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
-    assert ("uncertain by sigma_log_scale (frames.csv)" in header) == in_doubt
-    titles, *_, last = (tmp_path / "frames.csv").read_text().splitlines()
-    last = dict(zip(titles.split(","), last.split(","), strict=True))
-    assert (last["sigma_log_scale"] != "") == in_doubt
-
-
-def test_numbers_are_there_before_a_figure_is_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "plot_map", fail)
-    with pytest.raises(ValueError, match="cannot draw"):
-        tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    assert names(tmp_path) == NUMBERS | {"map.ply"}
-    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 3
-
-
-def test_an_overlay_that_cannot_be_drawn_ends_the_run_and_leaves_the_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(overlay, "draw_overlay", fail)
-    with pytest.raises(ValueError, match="cannot draw"):
-        tracking.track(small(3), tmp_path, SETTINGS)
-    assert names(tmp_path) == NUMBERS | FIGURES
-
-
 def test_the_map_shows_the_reference_in_its_own_frame_and_unit(tmp_path, monkeypatch):
     """Of the frames tracked; the trajectory's error is the rest, in the reference's unit."""
     drawn = {}
     monkeypatch.setattr(tracking, "plot_map", lambda *data, **more: drawn.update(more, data=data))
-    whole, source = small(40), small(12)
-    written = tracking.track(
-        replace(source, reference=whole.reference), tmp_path, SETTINGS, overlay=False
-    )
+    true = small(40).reference
+    assert true is not None
+    written = tracked(replace(small(12), reference=true), tmp_path)
     estimate, reference = drawn["data"][0], drawn["reference"]
     assert estimate.shape == reference.shape
     # One factor between the lengths of the two worlds, and no turn between their shapes.
-    ate, true = written["ate"], whole.reference
-    assert true is not None
     scale = length(true.T_wc[:12]) / length(reference)
     error = scale * (estimate - reference)[:, :3, 3]
-    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(ate["rmse"], rel=1e-6)
+    rmse = np.sqrt(np.mean(np.sum(error**2, axis=1)))
+    assert rmse == pytest.approx(written["ate"]["rmse"], rel=1e-6)
     assert drawn["lost"] == [False] * 12
 
 
@@ -93,114 +224,93 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
     source = small(3)
     assert source.reference is not None
     late = source.reference._replace(times=source.reference.times + 100)
-    written = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
+    written = tracked(replace(source, reference=late), tmp_path)
     assert "0 poses" in written["no_ate"]
-    assert names(tmp_path) == NUMBERS | FIGURES
+    assert names(tmp_path) == ALL
 
 
-def test_a_video_in_which_nothing_is_seen_is_told_so(tmp_path):
-    source = small(4)
+@pytest.fixture(scope="module")
+def told():
+    """What the summary says of four frames of a source, or of one without or of another truth."""
+    own = small(4)
+    tracker = Tracker(own.calibration, SETTINGS)
+    history = [tracker.track(frame) for frame in own]
 
-    def black():
-        for image in source.images():
-            yield np.zeros_like(image)
+    def describe(source=own):
+        found = summary.summarised(source, tracker, history, tracker.points(), [0.1] * 4)
+        return found, summary.describe(found)
 
-    written = tracking.track(replace(source, images=black), tmp_path, SETTINGS, overlay=False)
-    told = summary.describe(written)
-    assert "no map could be started: none of its 4 frames" in told
-    assert "nan" not in told
-
-
-def test_an_interruption_of_the_start_waits_for_no_program(tmp_path, monkeypatch):
-    def stop(frames):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(tracking, "_write", fail)
-    with pytest.raises(KeyboardInterrupt):
-        tracking.track(small(3), tmp_path, SETTINGS, progress=stop)
-    assert not names(tmp_path)
+    return describe
 
 
-def test_what_ends_before_a_frame_is_timed_leaves_the_files_all_the_same(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking.Aside, "give", fail)
-    with pytest.raises(ValueError, match="cannot draw"):
-        tracking.track(small(3), tmp_path, SETTINGS)
-    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 1
-
-
-@pytest.mark.parametrize(("left", "said"), [(0.5, True), (0.9, False)])
-def test_a_focal_length_that_does_not_fit_is_told(tmp_path, monkeypatch, left, said):
-    found = BetterLens(1 / 1.2, -0.1, np.array([0.01, 0.02]), left)
+@pytest.mark.parametrize(
+    ("left", "distortion", "said"),
+    [
+        (0.5, False, "LENS: fx 109 and k1 -0.100 fit the matches better than the given 131 and"),
+        (0.9, False, ""),
+        (0.4, True, "LENS DISTORTION: fx 133 and k1 -0.100 fit"),
+    ],
+)
+def test_a_lens_that_does_not_fit_is_told(told, monkeypatch, left, distortion, said):
+    found = BetterLens(1.01 if distortion else 1 / 1.2, -0.1, np.array([0.01, 0.02]), left)
     monkeypatch.setattr(summary, "better_lens", lambda *_: found)
-    written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    told = "LENS: fx 109 and k1 -0.100 fit the matches better than the given 131 and 0.000: "
-    told += "they reduce the squared errors by 50%"
-    assert (told in summary.describe(written)) == said
-    assert ("better_lens" in written["calibration"]) == said
+    written, words = told()
+    assert ("better_lens" in written["calibration"]) == bool(said)
+    assert said in words
+    assert (f"they reduce the squared errors by {1 - left:.0%}" in words) == bool(said)
+    if said:
+        assert written["calibration"]["better_lens"]["k1"] == -0.1
+        assert bool(written["calibration"]["better_lens"]["distortion"]) == distortion
 
 
-def test_a_distortion_that_nobody_told_is_told_loudly(tmp_path, monkeypatch):
-    found = BetterLens(1.01, -0.08, np.array([0.01, 0.02]), 0.4)
-    monkeypatch.setattr(summary, "better_lens", lambda *_: found)
-    written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    assert "LENS DISTORTION: fx 133 and k1 -0.080 fit" in summary.describe(written)
-    assert written["calibration"]["better_lens"]["k1"] == -0.08
-    assert written["calibration"]["better_lens"]["distortion"]
-
-
-def test_a_focal_length_that_is_estimated_is_not_tried(monkeypatch):
-    monkeypatch.setattr(summary, "better_lens", fail)
-    guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
-    nothing = Points(*[np.zeros(0, int)] * 3, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
-    assert "better_lens" not in summary._calibration(guessed, [], nothing)
-
-
-def test_what_was_estimated_of_a_lens_is_told_by_name_with_its_sigma():
-    guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
-    lens = summary._lens(guessed)
-    assert list(lens) == ["fx", "fy", "cx", "cy", "k1", "k2"]
-    assert lens["k1"] == {"value": 0.0, "sigma": pytest.approx(0.15)}
-    known = replace(SETTINGS, calibration="known")
-    assert summary._lens(Tracker(small(1).calibration, known)) == {}
-
-
-def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):
+def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(told):
     source = small(4)
     assert source.reference is not None
     still = source.reference.T_wc.copy()
     still[:, :3, 3] = 0
-    reference = source.reference._replace(T_wc=still)
-    written = tracking.track(
-        replace(source, reference=reference), tmp_path, SETTINGS, overlay=False
-    )
+    written, words = told(replace(source, reference=source.reference._replace(T_wc=still)))
     assert 0 < written["orientation_rmse"] < 1
-    told = "coincide; an alignment by Sim(3) needs motion; orientation "
-    told += f"error {written['orientation_rmse']:.2f}°"
-    assert told in summary.describe(written)
+    expected = "coincide; an alignment by Sim(3) needs motion; orientation "
+    assert f"{expected}error {written['orientation_rmse']:.2f}°" in words
 
 
-def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeypatch, capsys):
-    said, asked = [], {}
+def test_a_video_in_which_nothing_is_seen_is_told_so(tmp_path):
+    source = small(4)
+    black = replace(source, images=lambda: (0 * image for image in source.images()))
+    words = summary.describe(tracked(black, tmp_path))
+    assert "no map could be started: none of its 4 frames" in words
+    assert "nan" not in words
 
-    class Bar(tqdm.tqdm):
-        def __init__(self, **options):
-            super().__init__(**options)
-            said.append(self.desc)
 
-        def set_description(self, desc=None, refresh=True):
-            said.append((self.n, desc))
+def test_pictures_that_repeat_are_counted_and_said(tmp_path):
+    source = small(4)
+    doubled = lambda: (image for image in source.images() for _ in (0, 1))  # noqa: E731
+    twice = replace(source, times=np.arange(8) / 60, images=doubled, reference=None)
+    written = tracked(twice, tmp_path)
+    assert (written["repeated"], written["tracked"], written["lost"]) == (4, 8, 0)
+    assert "4 pictures repeat the one before and were not used" in summary.describe(written)
+    assert [row["repeated"] for row in rows_of(tmp_path)] == ["0", "1"] * 4
+    assert written["matches_per_frame"] > 8
 
-    def tracked(source, out, settings, *, progress, **more):
-        asked.update(more)
-        for _ in range(5):
-            progress(1)
-        return {}
 
-    monkeypatch.setattr(tqdm.auto, "tqdm", Bar)
-    monkeypatch.setattr(tracking, "track", tracked)
+@pytest.mark.slow
+def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path):
+    """The way of a scale's doubt from a filter that has one into the files."""
+    source = small(3)
+    tracking.track(source, tmp_path, replace(SETTINGS, filter="scale_gauge+mixture3"))
+    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
+    assert "uncertain by sigma_log_scale (frames.csv)" in header
+    assert rows_of(tmp_path)[-1]["sigma_log_scale"] != ""
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_hands_over_what_is_wanted_and_says_what_was_written(monkeypatch, capsys):
+    asked = {}
+    monkeypatch.setattr(tracking, "track", lambda *_, **how: asked.update(how))
     monkeypatch.setattr(summary, "describe", str)
     TrackOptions(overlay=False, viewer=Path("seen.rrd"), frames=5).run()
-    assert said == ["compiling …", (summary.WARM_UP, "tracking")]
     assert (asked["overlay"], asked["viewer"]) == (False, Path("seen.rrd"))
     printed = capsys.readouterr().out
     assert "summary.json" in printed

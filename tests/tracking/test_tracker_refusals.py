@@ -100,13 +100,11 @@ def viewed(name, rerun=True):
 NO_MAP = r"map\.ply is not a map\.ply as jaxslam track writes it"
 READ = [
     (tum("0 0 0 0 0 0 0 1\n1 2 3\n"), r"bad\.txt, line 2: expected eight finite"),
-    (tum("0 0 0 nan 0 0 0 1\n"), r"bad\.txt, line 1: expected eight finite"),
     (tum("0 0 0 zero 0 0 0 1\n"), r"bad\.txt, line 1: expected eight finite"),
     (tum("0 0 0 0 0 0 0 0\n"), r"bad\.txt, line 1: the quaternion is zero"),
     (tum("# nothing\n"), r"bad\.txt has no poses"),
     (lambda x: read_tum(x / "none.txt"), "cannot read the trajectory"),
     (ply(""), NO_MAP),
-    (ply("ply\nend_header\n1 2 3\n"), NO_MAP),
     (ply("property float x\nend_header\na"), NO_MAP),
     (target("{"), r"t\.json.* not a JSON file"),
     (target([1]), r"t\.json.* has no list of points"),
@@ -116,7 +114,6 @@ READ = [
     (with_last(5), r"t\.json.* point 3 must be an object, not 5"),
     (with_last(point(name="d", position=[0, 1])), r"t\.json.* position of point d must be 3 fin"),
     (with_last(point(position="x")), r"t\.json.* position of point 3 must be .* not .x."),
-    (with_last(point(pixel=[1])), r"t\.json.* pixel of point 3 must be 2 finite"),
     (with_last(point(pixel=None)), r"t\.json.* point 3 needs either a `pixel` .* or a `patch`"),
     (with_last(point(patch="no.png")), r"no\.png: cannot be read as an image"),
     (target({"points": LINE}), r"t\.json.* its points are on one line"),
@@ -167,6 +164,7 @@ def begun_with_a_target(**settings):
     )
 
 
+GREY = np.zeros((240, 320), np.uint8)
 STILL = np.tile(np.eye(4), (60, 1, 1))
 OF_CALLS = [
     (lambda: absolute_trajectory_error(TIMES + 100, PATH, TIMES, PATH), "0 poses"),
@@ -174,7 +172,6 @@ OF_CALLS = [
     (lambda: absolute_trajectory_error(TIMES, STILL, TIMES, PATH), "coincide"),
     (lambda: relative_pose_error(TIMES, PATH, TIMES, PATH, seconds=1e4), "no two poses"),
     (lambda: synthetic_source(frames=0), "frames must be positive"),
-    (lambda: synthetic_source(width=-1), "width must be positive"),
     (lambda: synthetic_source(rate=0.0), "rate must be positive"),
     (forward, "closer than"),
     (
@@ -200,18 +197,14 @@ def test_what_makes_no_sense_is_refused(call, message):
         call()
 
 
-GREY = np.zeros((240, 320), np.uint8)
 PICTURES = [
     (np.zeros((240, 321), np.uint8), 1.0, "frame 1 is 321x240, but the calibration is for 320x240"),
     (np.zeros((240, 320, 4), np.uint8), 1.0, r"not of shape \(240, 320, 4\)"),
-    (np.zeros(240, np.uint8), 1.0, r"not of shape \(240,\)"),
     (np.zeros((0, 0), np.uint8), 1.0, r"not of shape \(0, 0\)"),
     (np.zeros((240, 320), np.uint16), 1.0, "not uint16"),
     (np.full((240, 320), 255.0), 1.0, "not floats from 255 to 255"),
-    (np.full((240, 320), np.nan), 1.0, "not floats from nan to nan"),
     (GREY, 0.0, "its time, 0.0 s, is not later"),
     (GREY, np.nan, "its time, nan s, is not later"),
-    (GREY, np.inf, "its time, inf s, is not later"),
 ]
 
 

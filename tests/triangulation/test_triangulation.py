@@ -22,12 +22,10 @@ from jaxslam.triangulation import (
     particles,
     push,
     quantiles,
-    summarise,
-    table,
 )
 
 PROBABILITIES = np.array([0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995])
-COUNT = 2**18
+COUNT = 2**17
 
 
 def true_depths(views, kind="triangulation"):
@@ -55,18 +53,16 @@ def test_true_depths_have_the_published_quantiles(views, at, expected):
 
 
 def focal_nodes(views):
-    """Nodes and weights for a Gaussian focal length."""
+    """Nodes of two Gaussian focal lengths, and their weights."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
-    return views.focal + views.focal_sigma * nodes, weights / weights.sum()
+    grids = np.meshgrid(*[views.focal + views.focal_sigma * nodes] * 2, indexing="ij")
+    return *grids, weights / weights.sum()
 
 
-@pytest.mark.parametrize(
-    "views", [TwoViews(), TwoViews(depth=6.0, pixel=560.0, baseline=0.9, nearest_depth=2.0)]
-)
-def test_particles_agree_with_quadrature_over_the_focal_lengths(views):
+def test_particles_agree_with_quadrature_over_the_focal_lengths():
+    views = TwoViews(depth=6.0, pixel=560.0, baseline=0.9, nearest_depth=2.0)
     # Given both focal lengths the bearings are Gaussian, and so is their difference baseline/z.
-    nodes, weights = focal_nodes(views)
-    f1, f2 = np.meshgrid(nodes, nodes, indexing="ij")
+    f1, f2, weights = focal_nodes(views)
     mean = (views.pixels[0] - views.centre) / f1 - (views.pixels[1] - views.centre) / f2
     sigma = np.hypot(views.pixel_sigma, views.centre_sigma) * np.hypot(1 / f1, 1 / f2)
     for share, depth in zip(
@@ -76,12 +72,11 @@ def test_particles_agree_with_quadrature_over_the_focal_lengths(views):
         assert weights @ nearer @ weights == pytest.approx(share, abs=0.001)
 
 
-@pytest.mark.parametrize("nearest_depth", [1.0, 3.0])
-def test_the_posterior_agrees_with_bayes_on_a_grid_of_inverse_depth(nearest_depth):
+def test_the_posterior_agrees_with_bayes_on_a_grid_of_inverse_depth():
     # The likelihood of the second pixel, the first taken as the ideal one plus noise.
+    nearest_depth = 1.0
     views = TwoViews(nearest_depth=nearest_depth, pixel=500.0)
-    nodes, weights = focal_nodes(views)
-    f1, f2 = np.meshgrid(nodes, nodes, indexing="ij")
+    f1, f2, weights = focal_nodes(views)
     inverse = np.linspace(0.02, 0.12, 4001)[:, None, None]
     bearing = (views.pixels[0] - views.centre) / f1
     predicted = f2 * (bearing - views.baseline * inverse) + views.centre
@@ -94,10 +89,9 @@ def test_the_posterior_agrees_with_bayes_on_a_grid_of_inverse_depth(nearest_dept
     np.testing.assert_allclose(np.interp(1 / found, inverse, nearer), PROBABILITIES, atol=0.001)
 
 
-@pytest.mark.parametrize("depth", [2.5, 15.0])
-def test_inverse_scaling_is_exact_where_the_calibration_is_known(depth):
+def test_inverse_scaling_is_exact_where_the_calibration_is_known():
     # Its observation is then linear: the filter's Gaussian is Bayes's, on the axis and off it.
-    views = TwoViews(depth=depth, pixel=620.0, calibration="known")
+    views = TwoViews(depth=2.5, pixel=620.0, calibration="known")
     truth = true_depths(views, "posterior")
     assert distance(estimated_depths("inverse_scaling", views), truth, 100.0).ks < 0.001
     assert distance(estimated_depths("inverse_depth", views), truth, 100.0).ks > 0.003
@@ -159,10 +153,6 @@ def test_a_ray_beyond_infinity_counts_as_infinitely_far():
     assert truth.beyond_infinity == pytest.approx(ndtr(-2.167 / 2.861), abs=0.003)
     assert np.all(truth.z > 0)
     assert quantiles(marginal(truth.z, truth.weight), np.array([0.9]))[0] == np.inf
-    summary = summarise(compare(views, particles=5000, measurements=0))
-    assert summary["farthest"] == pytest.approx(10 * views.depth)
-    assert summary["truth"]["triangulation"]["z"][-1] is None
-    assert "∞" in table(summary)
 
 
 def test_a_prior_that_denies_the_point_leaves_few_particles_and_no_nan():
@@ -173,12 +163,11 @@ def test_a_prior_that_denies_the_point_leaves_few_particles_and_no_nan():
 
 
 def test_single_precision_is_as_evenly_spread():
-    views = TwoViews()
-    expected = quantiles(true_depths(views), PROBABILITIES)
+    expected = quantiles(true_depths(TwoViews()), PROBABILITIES)
     with jax.enable_x64(False):
-        found = quantiles(true_depths(views), PROBABILITIES)
+        found = quantiles(true_depths(TwoViews()), PROBABILITIES)
     assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    np.testing.assert_allclose(found, expected, rtol=2e-4)
 
 
 def test_samples_do_not_depend_on_the_chunk(monkeypatch):
@@ -191,56 +180,55 @@ def test_samples_do_not_depend_on_the_chunk(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("call", "message"),
     [
-        ({"depth": -1.0}, "depth must be positive, not -1.0"),
-        ({"baseline": 0.0}, "baseline must be positive"),
-        ({"nearest_depth": float("nan")}, "nearest_depth must be finite, not nan"),
-        ({"pixel": 640.0}, "pixel must be in the image, from 0 to 640"),
-        ({"depth": 1.0}, "depth must be at least 1.219"),
-        ({"calibration": "wite"}, "did you mean white"),
-        ({"focal_sigma": -1.0}, "focal_sigma must not be negative"),
+        (lambda: TwoViews(depth=-1.0), "depth must be positive, not -1.0"),
+        (lambda: TwoViews(nearest_depth=float("nan")), "nearest_depth must be finite, not nan"),
+        (lambda: TwoViews(pixel=640.0), "pixel must be in the image, from 0 to 640"),
+        (lambda: TwoViews(depth=1.0), "depth must be at least 1.219"),
+        (lambda: TwoViews(calibration="wite"), "did you mean white"),
+        (lambda: TwoViews(focal_sigma=-1.0), "focal_sigma must not be negative"),
+        (lambda: compare(TwoViews(), particles=10), "particles must be at least 1000, not 10"),
+        (lambda: compare(TwoViews(), measurements=1), "measurements must be 0"),
     ],
 )
-def test_views_that_make_no_sense_are_named(fields, message):
+def test_what_makes_no_sense_is_named(call, message):
     with pytest.raises(ValueError, match=message):
-        TwoViews(**fields)
+        call()
 
 
 def test_the_command_writes_what_others_read(tmp_path, capsys):
-    small = ["--particles", "3000", "--measurements", "3", "--calibration", "shared"]
-    main(["triangulate", *small, "--nearest-depth", "2", "--out", str(tmp_path)])
+    """Of a point whose ray may be beyond infinity."""
+    small = ["--particles", "3000", "--measurements", "3", "--calibration", "white"]
+    far = ["--depth", "60", "--baseline", "0.2", "--nearest-depth", "2"]
+    main(["triangulate", *small, *far, "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "triangulation.json").read_text())
     assert summary["schema"] == 1
-    assert summary["views"] == dataclasses.asdict(TwoViews(calibration="shared", nearest_depth=2.0))
+    views = TwoViews(depth=60.0, baseline=0.2, nearest_depth=2.0)
+    assert summary["views"] == dataclasses.asdict(views)
+    assert summary["farthest"] == pytest.approx(10 * views.depth)
+    assert summary["truth"]["triangulation"]["z"][-1] is None
+    assert summary["truth"]["triangulation"]["beyond_infinity"] > 0.1
     assert (summary["particles"], summary["measurements"], summary["seed"]) == (3000, 3, 0)
     assert set(summary["truth"]) == {"triangulation", "posterior"}
     assert set(summary["estimates"]) == set(ESTIMATES)
     for result in (*summary["truth"].values(), *summary["estimates"].values()):
         assert len(result["x"]) == len(result["z"]) == len(summary["probabilities"])
-        assert result["beyond_infinity"] == 0
     found = summary["estimates"]["inverse_scaling"]["distance"]["posterior"]["z"]
-    for measure_name in ("ks", "wasserstein"):
-        assert found[measure_name].keys() == {"exact", "mean", "error"}
+    for of in found.values():
+        assert of.keys() == {"exact", "mean", "error"}
     assert (tmp_path / "triangulation.png").read_bytes().startswith(b"\x89PNG")
     assert {path.name for path in tmp_path.iterdir()} == {"triangulation.json", "triangulation.png"}
-    assert "inverse_depth" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "inverse_depth" in printed
+    assert "∞" in printed
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--depth", "-3"], "depth must be positive"),
-        (["--particles", "10"], "particles must be at least 1000, not 10"),
-        (["--measurements", "1"], "measurements must be 0"),
-        (["--calibration", "maybe"], "known: white, shared, known"),
-    ],
-)
-def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):
+def test_a_mistake_ends_with_status_2_and_one_line(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(["triangulate", *arguments, "--out", str(tmp_path / "out")])
+        main(["triangulate", "--depth", "-3", "--out", str(tmp_path / "out")])
     error = capsys.readouterr().err
     assert stop.value.code == 2
-    assert message in error
+    assert "depth must be positive" in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
