@@ -4,7 +4,6 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
 from cases import central, close, each_geometry, named, pose, quick_jit
@@ -52,7 +51,11 @@ def size(geometry):
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_tangent_counts_the_degrees_of_freedom_of_every_leaf(geometry):
+def test_dimensions_agree_with_the_group(geometry):
+    T = geometry.group.identity()
+    assert T.translation().size == geometry.point_dim == geometry.pixel_dim + 1
+    assert T.log().size == geometry.tangent_dim == tangent_dim(SplitPose.of(T))
+    assert geometry.tangent_dim == geometry.point_dim + geometry.rotation_group.tangent_dim
     assert tangent_dim(mixed(geometry, 0)) == size(geometry)
 
 
@@ -83,14 +86,6 @@ def test_retract_undoes_difference(geometry, seeds):
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_derivative_of_difference_after_retract_at_zero_is_the_identity(geometry):
-    tree = mixed(geometry, 3)
-    n = size(geometry)
-    J = quick_jit(jax.jacfwd(lambda delta: difference(retract(tree, delta), tree)))(jnp.zeros(n))
-    np.testing.assert_allclose(J, np.eye(n), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_perturbations_are_right_perturbations(geometry):
     T = pose(geometry, 5)
     delta = jnp.zeros(geometry.tangent_dim).at[0].set(0.5)
@@ -104,16 +99,7 @@ def test_planar_angle_turns_from_x_towards_z():
     np.testing.assert_allclose(quarter @ jnp.array([1.0, 0.0]), [0.0, 1.0], atol=1e-15)
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_dimensions_agree_with_the_group(geometry):
-    T = geometry.group.identity()
-    assert isinstance(T, jaxlie.MatrixLieGroup)
-    assert T.translation().size == geometry.point_dim == geometry.pixel_dim + 1
-    assert T.log().size == geometry.tangent_dim
-    assert geometry.tangent_dim == geometry.point_dim + geometry.rotation_group.tangent_dim
-
-
-ANGLES = (0.0, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2)
+ANGLES = (0.0, 1e-7, 1e-4, 1e-2)
 
 
 @cache
@@ -143,7 +129,7 @@ def test_a_motion_and_its_derivative_are_right_near_straight_ahead(geometry, dty
     np.testing.assert_allclose(slope, 0.5 - angle**2 / 8, rtol=bound)
 
 
-@pytest.mark.parametrize("angle", [*ANGLES, 0.3, 0.49, 0.51, 1.0, 3.0])
+@pytest.mark.parametrize("angle", [*ANGLES, 0.49, 0.51, 3.0])
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_exp_is_the_matrix_exponential_and_log_its_inverse(geometry, angle):
     direction = np.array([0.6, -0.7, 1.1, 0.48, -0.6, 0.64])[-geometry.tangent_dim :]
@@ -163,32 +149,25 @@ def test_exp_is_the_matrix_exponential_and_log_its_inverse(geometry, angle):
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_jacobians_by_the_first_order_retraction_are_those_of_retract(geometry):
+def test_jacobians_of_poses_whole_and_split_agree_with_central_differences(geometry):
     """`jacobian` differentiates through `nudge`; the definition is through `retract`."""
-    delta = np.linspace(-0.7, 0.9, geometry.tangent_dim)
-    core = {"pose": exp(geometry.group, jnp.asarray(delta)), "vector": jnp.array([0.3, -2.0])}
+    step, point = pose(geometry, 9, scale=1.0), jnp.arange(1.0, geometry.point_dim + 1)
+    of = {"whole": pose(geometry, 4), "split": SplitPose.of(pose(geometry, 10, scale=1.0))}
 
-    def function(core):
-        return {"pose": core["pose"].inverse() @ core["pose"] @ core["pose"], "v": core["vector"]}
+    def function(of):
+        T, U = of["split"].joined(), of["whole"]
+        seen = (T @ U).inverse() @ point
+        return {"seen": seen, "whole": U @ T @ U, "after": SplitPose.of(T @ step)}
 
-    by_definition = jax.jacfwd(lambda d: difference(function(retract(core, d)), function(core)))(
-        jnp.zeros(geometry.tangent_dim + 2)
-    )
-    np.testing.assert_allclose(jacobian(function, core), by_definition, atol=1e-13)
+    value = function(of)
+    error = quick_jit(lambda delta: difference(function(retract(of, delta)), value))
+    exact = np.asarray(quick_jit(lambda: jacobian(function, of))())
+    t = geometry.tangent_dim
+    assert exact.shape == (geometry.point_dim + 2 * t, 2 * t)
+    close(central(error, np.zeros(2 * t)), exact, relative=1e-9)
 
 
 # --- a pose whose position and orientation are perturbed apart ----------------------------------
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_a_split_pose_joins_to_the_pose_it_is_of(geometry):
-    T = pose(geometry, 6, scale=2.0)
-    split = SplitPose.of(T)
-    assert tangent_dim(split) == geometry.tangent_dim
-    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
-    again = SplitPose.of(split.joined())
-    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(split), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
@@ -196,6 +175,8 @@ def test_a_split_pose_moves_along_the_axes_of_its_frame_and_turns_in_its_own(geo
     T = pose(geometry, 7, scale=2.0)
     delta = np.array([0.3, -0.8, 0.5, 0.4, -0.9, 0.7])[: geometry.tangent_dim]
     n = geometry.point_dim
+    for again in (SplitPose.of(T).joined(), joined(T.rotation(), T.translation())):
+        np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
     move, subtract = compiled()
     moved = move(SplitPose.of(T), delta)
     np.testing.assert_allclose(moved.translation, T.translation() + delta[:n], atol=1e-15)
@@ -210,32 +191,6 @@ def test_a_split_pose_moves_along_the_axes_of_its_frame_and_turns_in_its_own(geo
     np.testing.assert_allclose(
         there.joined().as_matrix(), moved.joined().as_matrix(), rtol=0, atol=1e-14
     )
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_jacobians_from_and_to_split_poses_agree_with_central_differences(geometry):
-    """A step of the pose in the state, and a point seen from there."""
-    step, point = pose(geometry, 9, scale=1.0), jnp.arange(1.0, geometry.point_dim + 1)
-    split = SplitPose.of(pose(geometry, 10, scale=1.0))
-
-    def function(split):
-        T = split.joined()
-        return {"seen": T.inverse() @ point, "whole": T, "after": SplitPose.of(T @ step)}
-
-    value = function(split)
-    error = quick_jit(lambda delta: difference(function(retract(split, delta)), value))
-    exact = np.asarray(quick_jit(lambda: jacobian(function, split))())
-    t = geometry.tangent_dim
-    assert exact.shape == (geometry.point_dim + 2 * t, t)
-    close(central(error, np.zeros(t)), exact, relative=1e-9)
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_joined_is_the_pose_of_its_parts(geometry):
-    T = pose(geometry, 11, scale=2.0)
-    again = joined(T.rotation(), T.translation())
-    assert type(again) is geometry.group
-    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("split", [False, True], ids=["whole", "split"])

@@ -7,17 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.linalg import (
-    LARGE,
-    LEAF,
-    cholesky,
-    eigh,
-    inverse,
-    semidefinite_root,
-    symmetric_part,
-)
+from jaxslam.linalg import LARGE, LEAF, cholesky, eigh, inverse, semidefinite_root, symmetric_part
 
-SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105, LARGE + 9)
+SIZES = (1, 5, LEAF, LEAF + 1, 2 * LEAF + 3, LARGE + 9)
 
 
 def _positive(n, seed=0):
@@ -71,19 +63,8 @@ def test_cholesky_has_the_derivatives_of_central_differences(n):
     for got, plus, minus in zip(tangent, above, below, strict=True):
         expected = (plus - minus) / (2 * step)
         np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
-
-
-def test_cholesky_has_a_gradient():
-    A = jnp.asarray(_positive(6))
     gradient = jax.grad(lambda A: cholesky(A).log_det())(A)
     np.testing.assert_allclose(gradient, np.linalg.inv(A), rtol=1e-9, atol=1e-12)
-
-
-def test_vmap_of_cholesky_is_a_loop():
-    A = np.stack([_positive(7, seed) for seed in range(5)])
-    batch = jax.vmap(cholesky)(A)
-    for k in range(5):
-        np.testing.assert_allclose(batch.root[k], np.linalg.cholesky(A[k]), rtol=0, atol=1e-12)
 
 
 def test_semidefinite_root_has_any_rank_and_solves_in_its_range():
@@ -141,9 +122,7 @@ def test_inverse_is_numpys_and_needs_no_good_pivots(n):
     A = np.random.default_rng(n).normal(size=(n, n))
     A[0, 0] = 0 if n > 1 else 2.0
     np.testing.assert_allclose(jax.jit(inverse)(A) @ A, np.eye(n), rtol=0, atol=1e-10)
-
-
-def test_inverse_of_a_singular_matrix_is_not_finite():
+    # Of a singular matrix it is not finite.
     assert not np.isfinite(inverse(jnp.ones((3, 3)))).all()
 
 

@@ -123,7 +123,7 @@ def _compared(
         (_point(landmark, moved), T @ there),
         None if landmark.anchored else (landmark.transform(T.inverse(), moved), first),
         (_bearing(landmark.homogeneous(moved)[0]), _bearing(T @ there)),
-        (_point(landmark, landmark.scale(_LARGER, first)), _LARGER * there),
+        (_point(landmark, landmark.scale(_LARGER, moved)), _LARGER * (T @ there)),
         (_point(landmark, other), there),
         *((jax.jacfwd(function)(at), _central(function, at)) for function, at in derivatives),
         (_point(landmark, landmark.transform(behind, first)), behind @ there),

@@ -6,14 +6,13 @@ import pytest
 from cases import each_landmark, named
 
 import jaxslam
-from jaxslam.landmarks import InverseScaling
+from jaxslam.landmarks import InverseScaling, UnifiedInverseDepth
 
 IS = InverseScaling()
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("landmark", each_landmark, ids=named)
 def test_every_parametrization_passes(landmark):
     jaxslam.check_landmark(landmark)
@@ -82,6 +81,18 @@ def test_what_is_wrong_is_named_in_one_line(wrong, told):
     with pytest.raises(ValueError, match=rf"^inverse_scaling, planar: {told}") as error:
         jaxslam.check_landmark(with_functions(**wrong), jaxslam.PLANAR)
     assert "\n" not in str(error.value)
+
+
+class Staying(UnifiedInverseDepth):
+    """Its anchor stays where it is when all lengths are enlarged."""
+
+    def scale(self, factor, landmark):
+        return landmark.at[-1].divide(factor)
+
+
+def test_the_anchor_belongs_to_the_point():
+    with pytest.raises(ValueError, match="scale: the enlarged point"):
+        jaxslam.check_landmark(Staying(), jaxslam.PLANAR)
 
 
 def test_what_is_no_parametrization_is_refused():

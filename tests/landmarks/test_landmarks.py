@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import central, close, each_geometry, each_landmark, named, pose, quick_jit
+from cases import close, each_geometry, each_landmark, named, pose, quick_jit
 
 from jaxslam.geometry import joined
 from jaxslam.landmarks import (
@@ -17,7 +17,6 @@ from jaxslam.landmarks import (
     UnifiedInverseDepth,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
-from jaxslam.models.camera import Camera, project
 
 FOCAL = 650.0
 INVERSE_DEPTHS = (0.02, 0.15, 1.3)
@@ -87,157 +86,56 @@ def generic(landmark, geometry, inverse_depth=0.15):
 
 @with_geometry
 @every_landmark
-@pytest.mark.parametrize("inverse_depth", INVERSE_DEPTHS)
-def test_first_observation_puts_the_point_on_its_ray_at_its_depth(
-    landmark, geometry, inverse_depth
-):
-    initialise, _, _, euclidean = functions(landmark)
-    ray = jnp.append(bearing_of(geometry), 1.0)
-    point = euclidean(initialise(bearing_of(geometry), inverse_depth))
-    # Angles and their sines are good to some 1e-16 each.
-    np.testing.assert_allclose(point, ray / inverse_depth, rtol=1e-13)
-
-
-@with_geometry
-@every_landmark
-def test_size_is_the_number_of_parameters(landmark, geometry):
-    initialise, *_ = functions(landmark)
-    parameters = jax.eval_shape(initialise, bearing_of(geometry), 0.15)
-    assert parameters.shape == (landmark.size(geometry.point_dim),)
-
-
-@with_geometry
-@every_landmark
-def test_transform_moves_the_euclidean_point(landmark, geometry):
-    _, transform, _, euclidean = functions(landmark)
-    parameters, T = generic(landmark, geometry), pose(geometry, 2, scale=1.0)
-    moved = euclidean(transform(T, parameters))
-    np.testing.assert_allclose(moved, T @ euclidean(parameters), rtol=1e-13, atol=1e-13)
-
-
-@with_geometry
-@every_landmark
-def test_transforms_compose(landmark, geometry):
-    _, transform, *_ = functions(landmark)
-    parameters = generic(landmark, geometry)
-    T, U = pose(geometry, 4), pose(geometry, 5)
-    close(transform(T @ U, parameters), transform(T, transform(U, parameters)), relative=1e-13)
-    there = transform(T, parameters)
-    assert np.abs(there - parameters).max() > 0.01
-    close(transform(T.inverse(), there), parameters, relative=1e-13)
-
-
-@with_geometry
-@every_landmark
-def test_scale_enlarges_the_point_and_commutes_with_a_turn(landmark, geometry):
+def test_it_is_a_point_wherever_its_anchor_is(landmark, geometry):
+    """`check_landmark` has the rest, of a first sighting: here T U, and a length by a turn."""
     _, transform, _, euclidean = functions(landmark)
     parameters = generic(landmark, geometry)
-    enlarged = landmark.scale(1.7, parameters)
+    T, U = pose(geometry, 4, scale=1.0), pose(geometry, 5)
+    moved = transform(T @ U, parameters)
+    np.testing.assert_allclose(euclidean(moved), T @ U @ euclidean(parameters), rtol=1e-13)
+    close(moved, transform(T, transform(U, parameters)), relative=1e-13)
+    enlarged, turn = landmark.scale(1.7, parameters), joined(U.rotation(), 0 * U.translation())
     np.testing.assert_allclose(euclidean(enlarged), 1.7 * euclidean(parameters), rtol=1e-12)
-    turn = pose(geometry, 2)
-    turn = joined(turn.rotation(), 0 * turn.translation())
     turned = landmark.scale(1.7, transform(turn, parameters))
     np.testing.assert_allclose(transform(turn, enlarged), turned, rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.slow
-@with_geometry
-@every_landmark
-def test_derivatives_agree_with_central_differences(landmark, geometry):
-    parameters, T = generic(landmark, geometry), pose(geometry, 2)
-    p = geometry.pixel_dim
-
-    def first_seen(x):
-        return landmark.initialise(jnp.append(x[:p], 1.0), x[p], jnp.asarray(FOCAL))
-
-    def moved_by(delta):
-        return landmark.transform(T @ geometry.group.exp(delta), parameters)
-
-    def stacked(x):
-        return jnp.append(*landmark.homogeneous(x))
-
-    for name, function, at in (
-        ("initialise", first_seen, np.append(bearing_of(geometry), 0.15)),
-        ("transform by parameters", lambda x: landmark.transform(T, x), parameters),
-        ("transform by pose", moved_by, np.zeros(geometry.tangent_dim)),
-        ("homogeneous", stacked, parameters),
-    ):
-        exact = np.asarray(quick_jit(jax.jacfwd(function))(at))
-        assert np.isfinite(exact).all(), name
-        # Steps of 1e-6: rounding leaves about 1e-10 of the largest entry, curvature 1e-12.
-        close(central(quick_jit(function), at), exact, relative=1e-8)
-
-
-@pytest.mark.slow
 @with_geometry
 @at_infinity
-def test_a_point_at_infinity_is_nothing_special(landmark, geometry):
-    initialise, transform, homogeneous, _ = functions(landmark)
-    camera = Camera(jnp.full(geometry.pixel_dim, FOCAL), jnp.full(geometry.pixel_dim, 320.0))
-    T = pose(geometry, 6)
-    parameters = initialise(bearing_of(geometry), 0.0)
-    point, omega = homogeneous(transform(T, parameters))
-    assert omega == 0.0
-    # It turns with the rotation, and the translation does nothing.
-    ray = T.rotation() @ jnp.append(bearing_of(geometry), 1.0)
-    np.testing.assert_allclose(point / point[-1], ray / ray[-1], rtol=1e-13, atol=1e-15)
-
-    def pixel(parameters):
-        return project(camera, landmark.homogeneous(landmark.transform(T, parameters))[0])
-
-    J = np.asarray(quick_jit(jax.jacfwd(pixel))(parameters))
-    close(central(quick_jit(pixel), np.asarray(parameters)), J, relative=1e-7)
-
-
-@with_geometry
-@at_infinity
-def test_a_negative_inverse_depth_is_legal_and_continuous(landmark, geometry):
-    """Beyond infinity the pixel goes on as it came: no sign flips, nothing is clamped."""
+def test_infinity_and_beyond_are_nothing_special(landmark, geometry):
+    """The pixel goes on as it came: no sign flips, nothing is clamped; and ω = 0 only turns."""
     initialise, transform, homogeneous, _ = functions(landmark)
     T = pose(geometry, 6)
 
     def bearing_after(inverse_depth):
-        parameters = transform(T, initialise(bearing_of(geometry), inverse_depth))
-        point, omega = homogeneous(parameters)
-        # IS carries the focal length as its scale; the sign is what matters.
-        np.testing.assert_allclose(np.sign(omega), np.sign(inverse_depth))
+        point, omega = homogeneous(transform(T, initialise(bearing_of(geometry), inverse_depth)))
+        assert np.sign(omega) == np.sign(inverse_depth)
         assert point[-1] > 0
         return np.asarray(point[:-1] / point[-1])
 
     before, at, after = (bearing_after(w) for w in (1e-3, 0.0, -1e-3))
+    ray = T.rotation() @ jnp.append(bearing_of(geometry), 1.0)
+    np.testing.assert_allclose(at, ray[:-1] / ray[-1], rtol=1e-13)
     assert np.abs(after - before).max() > 1e-5
     # The second difference of a smooth function, O(1e-6); a flip would be of order 1.
     np.testing.assert_allclose(after - at, at - before, rtol=0, atol=1e-6)
 
 
 @with_geometry
-def test_inverse_scaling_is_linear_in_the_landmark(geometry):
-    _, transform, *_ = functions(InverseScaling())
-    T, n = pose(geometry, 7), geometry.point_dim
-    a, b = np.random.default_rng(0).normal(size=(2, n + 1))
-    close(transform(T, 2 * a - 3 * b), 2 * transform(T, a) - 3 * transform(T, b), relative=1e-13)
-
-
-@with_geometry
-def test_inverse_scaling_starts_in_pixels(geometry):
-    """P22–P26: (u − cx, v − cy, f, f/d)."""
-    initialise, *_ = functions(InverseScaling())
-    expected = [*(FOCAL * bearing_of(geometry)), FOCAL, FOCAL * 0.2]
-    np.testing.assert_allclose(initialise(bearing_of(geometry), 0.2), expected, rtol=1e-15)
-
-
-@with_geometry
-def test_inverse_depth_holds_anchor_angles_and_inverse_distance(geometry):
-    """θ = atan2(nx, nz), φ = atan2(−ny, √(nx² + nz²)), ρ along the ray, not along the axis."""
+def test_parameters_are_the_published_ones(geometry):
+    """P22–P26: (u − cx, v − cy, f, f/d). And an anchor, θ = atan2(nx, nz), φ = atan2(−ny, √(nx² +
+    nz²)), and ρ along the ray, not along the axis."""
+    bearing = bearing_of(geometry)
+    scaling = functions(InverseScaling())[0](bearing, 0.2)
+    np.testing.assert_allclose(scaling, [*(FOCAL * bearing), FOCAL, FOCAL * 0.2], rtol=1e-15)
     initialise, transform, *_ = functions(UnifiedInverseDepth())
-    ray = np.append(bearing_of(geometry), 1.0)
-    theta = np.arctan2(ray[0], ray[-1])
-    phi = [np.arctan2(-ray[1], np.hypot(ray[0], ray[-1]))] if geometry.point_dim == 3 else []
-    angles = [theta, *phi]
-    parameters = initialise(bearing_of(geometry), 0.2)
+    ray = np.append(bearing, 1.0)
+    angles = [np.arctan2(ray[0], ray[-1])]
+    if geometry.point_dim == 3:
+        angles.append(np.arctan2(-ray[1], np.hypot(ray[0], ray[-1])))
+    parameters, T = initialise(bearing, 0.2), pose(geometry, 8)
     expected = [*np.zeros(ray.size), *angles, 0.2 / np.linalg.norm(ray)]
     np.testing.assert_allclose(parameters, expected, rtol=1e-14)
-    T = pose(geometry, 8)
     np.testing.assert_allclose(transform(T, parameters)[: ray.size], T.translation(), atol=1e-15)
 
 
@@ -248,11 +146,10 @@ def angle_between(a, b):
     return np.arccos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-@pytest.mark.parametrize("seed", range(3))
 @with_geometry
-def test_parallax_angle_is_the_triangle_of_two_anchors_and_a_point(geometry, seed):
+def test_parallax_angle_is_the_triangle_of_two_anchors_and_a_point(geometry):
     """Two sides and angles of a triangle by plain trigonometry: the law of sines."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     main, associate = rng.uniform(-1, 1, (2, geometry.point_dim))
     point = rng.uniform(2, 6, geometry.point_dim)
     ray, baseline = point - main, associate - main
@@ -316,7 +213,7 @@ def with_last_sigma(size, sigma):
     return covariance
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 2])
 @with_geometry
 def test_inverse_depth_becomes_cartesian_exactly_where_it_is_linear(geometry, seed):
     landmark, n = InverseDepthToCartesian(), geometry.point_dim
@@ -346,7 +243,7 @@ def test_a_point_at_or_beyond_infinity_does_not_become_cartesian(geometry, rho):
     assert all(np.isfinite(part).all() for part in J)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 2])
 @with_geometry
 def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geometry, seed):
     landmark, n = ParallaxAngle(), geometry.point_dim
@@ -374,14 +271,3 @@ def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geo
     # Once only: the second anchor stays, however much larger another parallax is.
     again = convert(landmark, camera_at(0.3), anchored, covariance)
     np.testing.assert_array_equal(again, anchored)
-
-
-@pytest.mark.parametrize("landmark", [InverseDepthToCartesian(), ParallaxAngle()], ids=named)
-@with_geometry
-def test_until_its_conversion_a_landmark_is_one_of_unified_inverse_depth(geometry, landmark):
-    parameters, plain = generic(landmark, geometry), generic(UnifiedInverseDepth(), geometry)
-    ours, theirs = (
-        functions(p)[2](x) for p, x in ((landmark, parameters), (UnifiedInverseDepth(), plain))
-    )
-    np.testing.assert_allclose(jnp.append(*ours), jnp.append(*theirs), rtol=1e-14)
-    assert parameters[-1] == 0.0

@@ -144,52 +144,43 @@ def test_two_steps_are_the_step_of_all_readings():
 
 
 def test_a_unit_at_rest_reads_the_opposite_of_gravity_and_stays():
-    imu = an_imu()
+    """As it does of the control that is still."""
+    imu, none = an_imu(), jnp.zeros(18)
     down = np.array([0.6, 0.0, -0.8])
     state = replace(imu.start()[0], down=jnp.asarray(down))
-    control = compiled()(np.full(10, 0.01), np.zeros((10, 3)), np.tile(-9.81 * down, (10, 1)))
-    step = quick_jit(lambda: imu.displacement(state, jnp.zeros(18), control))()
-    np.testing.assert_allclose(step.as_matrix(), np.eye(4), atol=1e-14)
-    after = quick_jit(lambda: imu.next(state, jnp.zeros(18), control))()
-    np.testing.assert_allclose(after.velocity, 0, atol=1e-14)
-    np.testing.assert_allclose(after.down, down, atol=1e-14)
+    resting = compiled()(np.full(10, 0.01), np.zeros((10, 3)), np.tile(-9.81 * down, (10, 1)))
+    after = quick_jit(lambda of: (imu.displacement(state, none, of), imu.next(state, none, of)))
+    for control in (resting, imu.still()):
+        check_control(imu, control)
+        step, later = after(control)
+        np.testing.assert_allclose(step.as_matrix(), np.eye(4), atol=1e-14)
+        np.testing.assert_allclose(difference(later, state), 0, atol=1e-13)
+    with pytest.raises(ValueError, match="the control of Imu is Increments"):
+        check_control(imu, jnp.asarray(0.1))
 
 
 def test_the_camera_moves_as_it_is_mounted_on_the_unit():
-    imu, control = an_imu(), compiled()(*readings(8))
-    alone = replace(imu, camera_from_imu=np.eye(4))
-    state = variables(imu)
-    step, of_unit = quick_jit(
-        lambda: (imu.displacement(state, NOISE, control), alone.displacement(state, NOISE, control))
-    )()
-    T_CI = np.asarray(imu.camera_from_imu)
-    np.testing.assert_allclose(
-        step.as_matrix(), T_CI @ of_unit.as_matrix() @ np.linalg.inv(T_CI), atol=1e-14
-    )
+    """And `T_CI ← T_CI Exp(δ)` where that is estimated; the length of `down` means nothing."""
+    off = jnp.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
+    estimated = an_imu(mount_sigma=(0.01,) * 3 + (0.02,) * 3)
+    T_CI = np.asarray(estimated.camera_from_imu) @ exp(jaxlie.SE3, off).as_matrix()
+    known, alone = an_imu(camera_from_imu=T_CI), an_imu(camera_from_imu=np.eye(4))
+    control, state = compiled()(*readings(8)), variables(known)
+    off_by = replace(state, mount=off)
+    longer = replace(state, down=1.7 * state.down)
 
+    @quick_jit
+    def made():
+        given = (alone, state), (known, state), (known, longer), (estimated, off_by)
+        return [(i.displacement(x, NOISE, control), i.next(x, NOISE, control)) for i, x in given]
 
-def test_the_length_of_gravitys_direction_means_nothing():
-    imu, control = an_imu(), compiled()(*readings(8))
-    state = variables(imu)
-
-    def step(length):
-        state_ = replace(state, down=state.down * length)
-        return imu.displacement(state_, NOISE, control), imu.next(state_, NOISE, control)
-
-    one, other = quick_jit(lambda: (step(1.0), step(1.7)))()
-    np.testing.assert_allclose(difference(one, other), 0, atol=1e-13)
-
-
-def test_the_control_that_is_still_moves_nothing_and_is_one():
-    imu = an_imu()
-    check_control(imu, imu.still())
-    state = imu.start()[0]
-    after = quick_jit(lambda: imu.next(state, jnp.zeros(18), imu.still()))()
-    np.testing.assert_allclose(difference(after, state), 0, atol=1e-15)
-    step = quick_jit(lambda: imu.displacement(state, NOISE, imu.still()))()
-    np.testing.assert_allclose(step.as_matrix(), np.eye(4), atol=1e-15)
-    with pytest.raises(ValueError, match="the control of Imu is Increments"):
-        check_control(imu, jnp.asarray(0.1))
+    (of_unit, _), (expected, plain), *others = made()
+    by_hand = T_CI @ of_unit.as_matrix() @ np.linalg.inv(T_CI)
+    for step, after in ((expected, plain), *others):
+        np.testing.assert_allclose(step.as_matrix(), by_hand, atol=1e-13)
+        np.testing.assert_allclose(after.velocity, plain.velocity, atol=1e-13)
+    np.testing.assert_array_equal(others[1][1].mount, off)
+    assert estimated.start()[1].shape == (18, 18)
 
 
 @pytest.mark.parametrize(
@@ -231,26 +222,3 @@ def test_what_is_told_of_the_start_is_off_by_its_sigma_and_readings_by_theirs():
     found = np.asarray(squared(jax.random.split(jax.random.key(3), 300)))
     p = stats.chi2(6 * 300).cdf(found.sum())
     assert FALSE_ALARM / 2 < p < 1 - FALSE_ALARM / 2
-
-
-def test_a_mount_that_is_estimated_moves_the_camera_as_the_true_one():
-    """`T_CI ← T_CI Exp(δ)`."""
-    imu, control = an_imu(mount_sigma=(0.01,) * 3 + (0.02,) * 3), compiled()(*readings(8))
-    off = jnp.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
-    T_CI = np.asarray(imu.camera_from_imu) @ exp(jaxlie.SE3, off).as_matrix()
-    exact = an_imu(camera_from_imu=T_CI)
-
-    @quick_jit
-    def both():
-        state = replace(variables(imu), mount=off)
-        known = replace(state, mount=jnp.zeros(0))
-        return (
-            imu.displacement(state, NOISE, control),
-            exact.displacement(known, NOISE, control),
-            imu.next(state, NOISE, control).mount,
-        )
-
-    found, expected, after = both()
-    np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-13)
-    np.testing.assert_array_equal(after, off)
-    assert imu.start()[1].shape == (18, 18)

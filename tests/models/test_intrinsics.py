@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-import pytest
 from cases import Case, quick_jit, run_filter
 
 CALIBRATION = slice(9, 11)
@@ -16,7 +15,7 @@ VARIANCES = np.array([3.0, 2.0]) ** 2
 def turning():
     """Forwards in a bend, by a camera whose intrinsics are off by one draw."""
     return Case(
-        "matched-turn", steps=20, landmarks=6, velocity=[0.0, 1.2, 0.9], true_calibration="constant"
+        "matched-turn", steps=20, landmarks=5, velocity=[0.0, 1.2, 0.9], true_calibration="constant"
     )
 
 
@@ -60,9 +59,8 @@ def test_a_turning_camera_estimates_its_calibration():
     assert (np.asarray(state.core.calibration) != 0).all()
 
 
-@pytest.mark.parametrize("calibration", ["consider", "estimated"])
-def test_a_calibration_without_uncertainty_is_a_known_one(calibration):
-    _, covariances, results = run(calibration, sigma=np.zeros(2))
+def test_a_calibration_without_uncertainty_is_a_known_one():
+    _, covariances, results = run("estimated", sigma=np.zeros(2))
     _, known_covariances, known_results = run("known")
     for a, b in zip(results, known_results, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

@@ -78,14 +78,29 @@ def test_a_batch_is_worked_on_in_blocks_of_those_alive_wherever_they_are():
     assert len(found) == 16  # one block, and not 64
 
 
-@pytest.mark.parametrize("least", [1, 8, 1000])
-def test_a_batch_gives_what_each_gives_alone(least, monkeypatch):
-    monkeypatch.setattr(lazy, "LEAST", least)
+def test_a_batch_and_a_batch_of_batches_give_what_each_gives_alone(monkeypatch):
+    """Also of a function that is closed over something of the batch."""
+
+    def given(*of):
+        return map_where(moved, *of)
+
+    def closed(values, alive, by):
+        return map_where(lambda value: moved(value, by), values, alive)
+
+    def parts(*batch):
+        split = jax.tree.map(lambda x: x.reshape(4, -1, *x.shape[1:]), batch)
+        after = jax.vmap(jax.vmap(given))(*split)
+        return jax.tree.map(lambda x: x.reshape(BATCH, *x.shape[2:]), after)
+
     values, alive, by = drawn()
-    in_batch = jax.jit(jax.vmap(lambda *given: map_where(moved, *given)))(values, alive, by)
-    check(in_batch, values, alive, by)
-    one_by_one = jax.jit(lambda *batch: jax.lax.map(lambda given: map_where(moved, *given), batch))
-    check(one_by_one(values, alive, by), values, alive, by)
+    for least, function in (
+        *((least, jax.vmap(given)) for least in (1, 8, 1000)),
+        (8, lambda *batch: jax.lax.map(lambda of: given(*of), batch)),
+        (8, jax.vmap(closed)),
+        (8, parts),
+    ):
+        monkeypatch.setattr(lazy, "LEAST", least)
+        check(jax.jit(function)(values, alive, by), values, alive, by)
 
 
 @pytest.mark.parametrize("in_batch", [False, True])
@@ -102,21 +117,6 @@ def test_what_is_not_alive_is_zero(in_batch):
     x = jnp.where(alive[..., None], values["x"], 0)
     np.testing.assert_array_equal(after["x"], x)
     np.testing.assert_allclose(after["sum"], by[:, None] * x.sum(-1), rtol=1e-12)
-
-
-def test_what_a_function_is_closed_over_may_be_of_the_batch():
-    def closed(values, alive, by):
-        return map_where(lambda value: moved(value, by), values, alive)
-
-    values, alive, by = drawn()
-    check(jax.jit(jax.vmap(closed))(values, alive, by), values, alive, by)
-
-
-def test_batches_of_batches():
-    values, alive, by = drawn()
-    parts = jax.tree.map(lambda x: x.reshape(4, -1, *x.shape[1:]), (values, alive, by))
-    after = jax.jit(jax.vmap(jax.vmap(lambda *given: map_where(moved, *given))))(*parts)
-    check(jax.tree.map(lambda x: x.reshape(BATCH, *x.shape[2:]), after), values, alive, by)
 
 
 @pytest.mark.parametrize("in_batch", [False, True])
