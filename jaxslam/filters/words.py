@@ -22,6 +22,7 @@ from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.remedies.random_walk import RandomWalk
 from jaxslam.filters.rivals.depth_particles import with_depth_particles
+from jaxslam.filters.rivals.nodes import with_nodes
 from jaxslam.filters.rivals.rays import with_rays
 from jaxslam.filters.slam import Piece, Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
@@ -91,6 +92,7 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "checked": lambda slam, percent=150: replace(slam, gate=Gate(tolerance=percent / 100)),
     "particles": with_depth_particles,
     "rays": with_rays,
+    "nodes": with_nodes,
 }
 """What `+name` behind a filter's name makes of it, in the order of this table, whatever the order
 of the name. Its piece takes the place of the filter's own: in `recommended+directions` that of the
@@ -106,7 +108,8 @@ recommended mixture. The number that may follow the name is
 - `rest`: the frames of the longest window of a start;
 - `submaps`: the slots for landmarks out of view until their submap ends;
 - `checked`: by how much a match may be off beyond its noise, in percent of that;
-- `particles`, `rays`: the greatest depth of a delayed initialisation, m.
+- `particles`, `rays`: the greatest depth of a delayed initialisation, m;
+- `nodes`: the parallax after which a node of a map of nodes ends, %.
 """
 _LEFT = {"lag": "a fixed-lag window, slower and less consistent than a mixture, left in 0.6"}
 

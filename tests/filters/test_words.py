@@ -143,6 +143,7 @@ IN_WORLD = (
         for word in MODIFIERS
         if word != late
     ),
+    ({"nodes"}, "nodes take the place of all pieces but these: robocentric"),
 )
 """What a world-centric filter of Cartesian landmarks cannot be, and what it is told; and a start
 from a window is of a mixture."""

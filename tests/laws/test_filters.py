@@ -20,12 +20,16 @@ OTHERS = [
     "scale_gauge+mixture3", "world+fej", "world+fej2", "world+decoupled", "world+oc",
     "robocentric+iterated3", "robocentric+drift", "robocentric+checked",
     "scale_gauge+directions3", "scale_gauge+mixture3+rest4",
-    "world+particles", "robocentric+rays", "recommended",
+    "world+particles", "robocentric+rays", "robocentric+nodes", "recommended",
 ]  # fmt: skip
 LONG = ("a batch is", "single precision", "its derivative")
-EXCEPT = {"robocentric+rays": "it counts what it used", "world+particles": "a landmark that is"}
-"""Kept in another way, as docstrings say: of a ray every member is counted, and a landmark whose
-depth is not known is not in the map."""
+EXCEPT = {
+    "robocentric+rays": "it counts what it used",
+    "world+particles": "a landmark that is",
+    "robocentric+nodes": "single precision",
+}
+"""Kept in another way, as docstrings say: of a ray every member is counted, a landmark whose depth
+is not known is not in the map, and information needs double precision."""
 
 
 def row(name, told):
@@ -44,8 +48,8 @@ ROWS = [
 
 @cache
 def case(name):
-    delayed = name.endswith(("particles", "rays"))
-    landmark = "cartesian" if delayed else "inverse_scaling"
+    ends_in = {"particles": "cartesian", "rays": "cartesian", "nodes": "image_plane"}
+    landmark = ends_in.get(name.rpartition("+")[2], "inverse_scaling")
     return FilterCase(make_filter(name, landmark=landmark, **scenario_pieces(WORLD)), WORLD)
 
 

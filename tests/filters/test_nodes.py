@@ -1,0 +1,275 @@
+"""Tests of a map of nodes: its information, its edges, and what it is not made of."""
+
+import pickle
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import close, each_geometry, named, quick_jit
+
+from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
+from jaxslam.filters.rivals.nodes import Nodes
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.geometry import PLANAR, difference, homogeneous_apply, identity, jacobian, log, retract
+from jaxslam.landmarks import ImagePlane
+from jaxslam.models.calibration import White
+from jaxslam.models.camera import Camera
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Features, PriorMap
+from jaxslam.models.sensors import Pinhole
+from jaxslam.simulation import scenario
+
+DT, COUNT, FOCAL, SIGMA = 0.1, 6, 400.0, 0.5
+INVERSE_DEPTH, DEPTH_SIGMA = 0.25, 0.05
+BORN = np.array([0, 0, 0, 0, 0, 2])
+"""The frame in which each landmark is new."""
+VELOCITIES = {"planar": [0.6, 0.1, 0.05], "spatial": [0.6, 0.1, 0.2, 0.02, 0.05, 0.03]}
+
+
+def the_filter(geometry, sigma=SIGMA, **pieces):
+    p, t = geometry.pixel_dim, geometry.tangent_dim
+    velocity = np.array(VELOCITIES[geometry.name])
+    motion = ConstantVelocity(np.full(t, 0.2), velocity, np.linspace(0.01, 0.02, t))
+    sensor = Pinhole(Camera(np.full(p, FOCAL), np.full(p, 300.0)), sigma)
+    depth = InverseDepth(INVERSE_DEPTH, DEPTH_SIGMA)
+    slam = Slam(motion=motion, sensor=sensor, landmark=ImagePlane(), depth=depth, **pieces)
+    return Nodes(slam)
+
+
+@cache
+def path(geometry, steps):
+    """T_BC of a camera with its mean velocity."""
+    step = the_filter(geometry).slam.motion.displacement(
+        jnp.array(VELOCITIES[geometry.name]), jnp.zeros(geometry.tangent_dim), DT
+    )
+    poses = [identity(geometry, jnp.float64)]
+    for _ in range(steps):
+        poses.append(poses[-1] @ step)
+    return poses
+
+
+def world(geometry, steps, depths):
+    """Points in B, of these depths in the camera that sees them first."""
+    rng = np.random.default_rng(1)
+    poses = path(geometry, steps)
+    rays = np.column_stack(
+        [rng.uniform(-0.3, 0.3, (len(depths), geometry.pixel_dim)), depths * 0 + 1]
+    )
+    born = np.resize(BORN, len(depths))
+    return jnp.stack(
+        [poses[k] @ jnp.asarray(z * ray) for k, z, ray in zip(born, depths, rays, strict=True)]
+    )
+
+
+def frames_of(slam, geometry, steps, depths):
+    """Noise-free features of every frame: of landmarks in the map, and of new ones."""
+    points, slots = world(geometry, steps, depths), jnp.arange(len(depths))
+    born, seen, new = np.resize(BORN, len(depths)), [], []
+    for k, pose in enumerate(path(geometry, steps)):
+        inside = jax.vmap(pose.inverse().apply)(points)
+        pixels = jax.vmap(slam.slam.sensor.measure, in_axes=(0, None))(inside, 1.0)
+        seen.append(Features(slots, pixels, jnp.asarray(born < k)))
+        new.append(Features(slots, pixels, jnp.asarray(born == k)))
+    return (jax.tree.map(lambda *x: jnp.stack(x), *part) for part in (seen, new))
+
+
+def run(slam, seen, new):
+    """The states of all frames after frame 0, and their innovations."""
+    first = jax.tree.map(lambda x: x[0], new)
+
+    def step(state, frame):
+        state, innovation = slam.step(state, jnp.array(DT), *frame)
+        return state, (state, innovation, camera_pose(slam, state))
+
+    later = jax.tree.map(lambda x: x[1:], (seen, new))
+    return jax.lax.scan(step, slam.init(first.slots.size, first), later)[1]
+
+
+LEVEL = np.full(COUNT, 1 / INVERSE_DEPTH)
+"""Depths that are those of the prior: linearisation is at the truth."""
+
+
+@cache
+def level_run(geometry):
+    slam = the_filter(geometry)
+    return quick_jit(partial(run, slam))(*frames_of(slam, geometry, 4, LEVEL))
+
+
+def last(tree):
+    return jax.tree.map(lambda x: x[-1], tree)
+
+
+def batch(slam, geometry):
+    """The information of all cameras but the first, and of all landmarks, by their definitions."""
+    poses, points = path(geometry, 4), world(geometry, 4, LEVEL)
+    plane, t, sigma = ImagePlane(), geometry.tangent_dim, slam.slam.motion
+    landmarks = jax.vmap(lambda x: plane.initialise(x, jnp.ones(()), jnp.ones(())))(points)
+    told = jnp.asarray(sigma.velocity), jnp.zeros(t)
+    J = jacobian(lambda told: sigma.displacement(*told, DT), told)
+    J = J @ jnp.diag(jnp.concatenate([sigma.velocity_sigma, sigma.noise_sigma]))
+    root = np.linalg.inv(np.linalg.cholesky(J @ J.T))
+
+    def whitened(delta):
+        moves, values = delta[: 4 * t].reshape(4, t), landmarks + delta[4 * t :].reshape(COUNT, -1)
+        cameras = [poses[0], *(retract(T, move) for T, move in zip(poses[1:], moves, strict=True))]
+        rows = [root @ difference(cameras[1], poses[1])]
+        for k, T in enumerate(cameras):
+            for slot in np.flatnonzero(k >= BORN):
+                point, omega = plane.homogeneous(values[slot])
+                point = homogeneous_apply(T.inverse(), point, omega)
+                rows.append(slam.slam.sensor.measure(point, omega) / SIGMA)
+                if BORN[slot] == k:
+                    rows.append((omega / point[-1:]) / DEPTH_SIGMA)
+        return jnp.concatenate(rows)
+
+    J = jax.jacfwd(whitened)(jnp.zeros(4 * t + landmarks.size))
+    return np.asarray(J.T @ J), landmarks
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_the_information_of_a_node_is_that_of_all_its_frames_without_their_cameras(geometry):
+    """Of the last camera too, which leaves the map with the next frame."""
+    slam, cameras, t = the_filter(geometry), 4 * geometry.tangent_dim, geometry.tangent_dim
+    whole, landmarks = batch(slam, geometry)
+    across = whole[cameras:, :cameras]
+    wanted = whole[cameras:, cameras:] - across @ np.linalg.solve(
+        whole[:cameras, :cameras], across.T
+    )
+    state = last(level_run(geometry)[0])
+    close(state.node.landmarks, landmarks, 1e-7)
+    scale = np.sqrt(np.diagonal(wanted))
+    np.testing.assert_allclose(
+        state.node.information / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-5
+    )
+    P = np.linalg.inv(whole)[cameras - t :, cameras - t :]
+    np.testing.assert_allclose(camera_pose(slam, state)[1], P[:t, :t], rtol=1e-4, atol=1e-10)
+
+
+def test_a_camera_is_found_from_its_frame():
+    """So many numbers of a frame are none that the map could disagree with."""
+    innovation = level_run(PLANAR)[1]
+    each = [jax.tree.map(lambda x, k=k: x[k], innovation).nis_dof for k in range(4)]
+    assert each == [2, 2, 3, 3]
+    assert np.all(np.abs(innovation.nis) < 1e-9)
+
+
+DEPTHS = np.linspace(3.6, 4.4, 8)
+
+
+@cache
+def long_run(geometry):
+    slam = the_filter(geometry, 0.02)
+    return slam, quick_jit(partial(run, slam))(*frames_of(slam, geometry, 40, DEPTHS))
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_chain_of_nodes_follows_a_run_without_noise(geometry):
+    _, (states, _, (poses, covariances)) = long_run(geometry)
+    earlier = np.asarray(states.earlier.held).any(axis=1)
+    began = np.flatnonzero(np.asarray(jax.vmap(log)(states.node.camera) == 0).all(axis=1))
+    assert len(began) >= 1
+    assert not earlier[: began[0]].any()
+    assert earlier[began[0] :].all()
+    truth = jax.tree.map(lambda *x: jnp.stack(x), *path(geometry, 40)[1:])
+    apart = np.abs(jax.vmap(difference)(poses, truth))
+    way = float(np.linalg.norm(truth.translation()[-1]))
+    assert way > 2
+    assert apart.max() < 5e-3 * way
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    assert (apart < 3 * sigma + 1e-6).all()
+    # The metre is known no better in a later node than in the first.
+    assert (np.diff(sigma[:, 0]) > -0.2 * sigma[1:, 0]).all()
+
+
+def test_landmarks_are_seen_in_metres_from_a_later_node():
+    slam, (states, *_) = long_run(PLANAR)
+    slots = jnp.arange(len(DEPTHS))
+    told = quick_jit(lambda x: landmarks_in_camera(slam, x, slots, slam.slam.sensor))
+    chart, covariance = told(last(states))
+    inside = jax.vmap(path(PLANAR, 40)[-1].inverse().apply)(world(PLANAR, 40, DEPTHS))
+    truth = np.column_stack([inside[:, 0], np.ones(len(inside))]) / inside[:, 1:]
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert slam.in_map(last(states)).all()
+    assert (np.abs(chart - truth) < 3 * sigma + 1e-6).all()
+    assert (sigma[:, 1] < 0.2 * truth[:, 1]).all()
+
+
+def test_a_landmark_is_marginalised_and_its_slot_is_free():
+    slam, state, d = the_filter(PLANAR), last(level_run(PLANAR)[0]), 2
+    gone = np.arange(COUNT) == 1
+    after = quick_jit(lambda *x: slam.remove(*x))(state, jnp.asarray(gone))
+    assert slam.in_map(after).tolist() == (~gone).tolist()
+    rows = np.repeat(gone, d)
+    whole = np.asarray(state.node.information)
+    across = whole[np.ix_(~rows, rows)]
+    wanted = whole[np.ix_(~rows, ~rows)] - across @ np.linalg.solve(
+        whole[np.ix_(rows, rows)], across.T
+    )
+    close(np.asarray(after.node.information)[np.ix_(~rows, ~rows)], wanted, 1e-6)
+    assert not np.asarray(after.node.information)[rows].any()
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-12),
+        camera_pose(slam, after),
+        camera_pose(slam, state),
+    )
+
+
+def test_an_edge_stays_when_a_landmark_leaves_that_it_was_found_from():
+    slam, (states, *_) = long_run(PLANAR)
+    after = quick_jit(lambda *x: slam.remove(*x))(last(states), jnp.arange(len(DEPTHS)) == 3)
+    assert not after.earlier.held.any()
+    np.testing.assert_array_equal(after.edge_covariance, last(states).edge_covariance)
+
+
+def test_a_map_of_nodes_survives_a_pickle():
+    slam = make_filter(
+        "robocentric+nodes30", landmark="image_plane", **scenario_pieces(scenario("matched"))
+    )
+    assert pickle.loads(pickle.dumps(slam)) == slam
+    assert slam.left.parallax == 0.3
+
+
+def test_a_calibration_that_is_drawn_in_every_frame_is_no_information():
+    """A camera that may be off tells less of landmarks in every direction."""
+    exact = the_filter(PLANAR)
+    off = the_filter(PLANAR, calibration=White([3.0, 2.0]))
+    given = tuple(frames_of(exact, PLANAR, 4, LEVEL))
+    more, less = (last(quick_jit(partial(run, slam))(*given)[0]).node for slam in (exact, off))
+    lost = np.linalg.eigvalsh(more.information - less.information)
+    assert lost[0] > -1e-6 * lost[-1]
+    assert lost[-1] > 0.1 * np.linalg.eigvalsh(more.information)[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "landmark", "changes", "message"),
+    [
+        ("world+nodes", "image_plane", {}, "robocentric.nodes is accepted"),
+        ("robocentric+oc+nodes", "image_plane", {}, "robocentric.nodes is accepted"),
+        ("robocentric+mixture+nodes", "image_plane", {}, "robocentric.nodes is accepted"),
+        ("robocentric+nodes", "cartesian", {}, "of image_plane landmarks, not cartesian"),
+        ("robocentric+nodes", "image_plane", {"sensor": "position"}, "a camera, not of Position"),
+        (
+            "robocentric+nodes", "image_plane",
+            {"motion": "odometry", "odometry_sigma": [0.1] * 3}, "whose velocity is constant",
+        ),
+        ("robocentric+nodes", "image_plane", {"calibration": "consider"}, "drawn in every frame"),
+        ("robocentric+scene+nodes", "image_plane", {}, "on depth that have nothing in common"),
+    ],
+)  # fmt: skip
+def test_what_has_no_nodes_is_refused(name, landmark, changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_filter(name, landmark=landmark, **scenario_pieces(scenario("matched", changes)))
+
+
+def test_nodes_take_no_prior_map_and_a_step_at_least():
+    slam = the_filter(PLANAR)
+    known = PriorMap(jnp.arange(1), jnp.ones((1, 2)), jnp.eye(2))
+    with pytest.raises(ValueError, match="takes no prior map"):
+        slam.init(1, known=known)
+    with pytest.raises(ValueError, match="at least, not 0"):
+        replace(slam, steps=0)
