@@ -221,6 +221,8 @@ for shift, robot in zip((-0.25, 0.0, 0.25), logs, strict=True):
 axes.axvline(1, color="0.3", linewidth=0.8)
 axes.set(xscale="log", xlabel="σ should be × (1 is right)", yticks=range(len(rows)))
 axes.set_yticklabels(rows)
+axes.set_xticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
+axes.minorticks_off()
 axes.invert_yaxis()
 axes.legend()
 display(figure)
