@@ -6,7 +6,6 @@ two programs (one may contract `a b + c`, or vectorise), has a bound, and never 
 alone where zero is expected.
 """
 
-import itertools
 from functools import cache, partial
 from typing import Any
 
@@ -23,7 +22,6 @@ from jaxslam.geometry import GEOMETRIES
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.camera import Camera
 from jaxslam.models.motion import ConstantVelocity
-from jaxslam.models.observations import Capacity
 from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Room, features, scenario, sightings, simulate
 
@@ -33,26 +31,11 @@ few_landmarks = [LANDMARKS[name] for name in ("inverse_scaling", "inverse_depth"
 """Where every parametrization would cost minutes: homogeneous, anchored with angles, plain."""
 
 
-def crossed(names, *axes, quick):
-    """The cross of some axes as a parametrization of which all but the rows in `quick`, which have
-    every value at least once, are slow: the others would find a fault of one combination alone."""
-    rows = list(itertools.product(*axes))
-    assert all(any(row[i] == x for row in quick) for i, axis in enumerate(axes) for x in axis)
-    given = [pytest.param(*row, marks=() if row in quick else pytest.mark.slow) for row in rows]
-    return pytest.mark.parametrize(names, given, ids=named)
-
-
 def quick_rows(count, rows):
     """So many of the rows of a parametrization; the others are slow, as they would find a fault of
     theirs alone."""
-    return [
-        *rows[:count],
-        *(pytest.param(*as_row(x), marks=pytest.mark.slow) for x in rows[count:]),
-    ]
-
-
-def as_row(values):
-    return values if type(values) is tuple else (values,)
+    others = (x if type(x) is tuple else (x,) for x in rows[count:])
+    return [*rows[:count], *(pytest.param(*x, marks=pytest.mark.slow) for x in others)]
 
 
 def named(value):
@@ -134,7 +117,8 @@ def run_filter(capacity, slam, controls, first, known, new):
     def step(state, frame):
         state, innovation = slam.step(state, *frame)
         pose, pose_covariance = camera_pose(slam, state)
-        return state, (pose, pose_covariance, state.covariance, innovation.nis)
+        whole = getattr(state, "covariance", None)  # which a Gaussian sum has for each member
+        return state, (pose, pose_covariance, whole, innovation.nis)
 
     return jax.lax.scan(step, state, (controls, known, new))
 
@@ -180,30 +164,6 @@ class Case:
     def frames(self, i):
         """Features of run i: first, known, new."""
         return jax.tree.map(lambda x: x[i], self.features)
-
-
-def pose_run(of, slam, i=0, count=None):
-    """Every step's pose, its covariance, NIS and residual of run i."""
-    first, known, new = of.frames(i)
-    controls = of.controls(i)
-    capacity = Capacity(of.capacity, known.slots.shape[1], new.slots.shape[1])
-
-    @quick_jit
-    def whole(first, known, new, controls):
-        state = slam.init(capacity, first)
-
-        def step(state, frame):
-            state, innovation = slam.step(state, *frame)
-            pose, covariance = camera_pose(slam, state)
-            return state, (pose, covariance, innovation.nis, innovation.residual)
-
-        return jax.lax.scan(step, state, (controls, known, new))
-
-    parts = (known, new, controls)
-    if count is not None:
-        parts = jax.tree.map(lambda x: x[:count], parts)
-    known, new, controls = parts
-    return whole(first, known, new, controls)
 
 
 def keys_used(monkeypatch, function):

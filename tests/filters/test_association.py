@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Around, Case, quick_jit
+from cases import Case, quick_jit
 from scipy.stats import chi2
 
 from jaxslam.filters import association
@@ -67,19 +67,22 @@ def rates(name, wrong, runs=20):
 
 
 @pytest.mark.parametrize("name", ASSOCIATIONS)
-def test_what_is_true_is_kept(name):
+def test_what_is_true_is_kept_and_what_is_not_valid_is_never_believed(name):
     assert rates(name, 0.0)[0] > 0.97
+    matches, _ = found(np.random.default_rng(3))
+    for valid in (jnp.arange(M) % 3 > 0, jnp.zeros(M, bool)):
+        assert not np.any(compiled[name](matches._replace(valid=valid)) & ~valid)
 
 
-@pytest.mark.parametrize(("name", "kept", "let"), [("sequential", 0.95, 0.05), ("jcbb", 0.7, 0.1)])
+@pytest.mark.parametrize(
+    ("name", "kept", "let"),
+    [("sequential", 0.95, (0, 0.05)), ("jcbb", 0.7, (0, 0.1)), ("individual", 0.9, (0.9, 1))],
+)
 def test_of_as_many_wrong_as_right_matches_the_wrong_ones_are_put_out(name, kept, let):
+    """But not by their ellipses alone."""
     found_kept, found_let = rates(name, 0.5)
     assert found_kept > kept
-    assert found_let < let
-
-
-def test_an_ellipse_alone_does_not_see_a_wrong_match():
-    assert rates("individual", 0.5)[1] > 0.9
+    assert let[0] <= found_let <= let[1]
 
 
 @pytest.mark.parametrize("name", JOINT)
@@ -111,26 +114,6 @@ def test_of_two_places_of_one_landmark_one_is_believed(name):
     assert not (believed[:half] & believed[half:]).any()
 
 
-@pytest.mark.parametrize("name", ASSOCIATIONS)
-def test_what_is_not_valid_is_never_believed(name):
-    matches, _ = found(np.random.default_rng(3))
-    valid = jnp.arange(M) % 3 > 0
-    believed = compiled[name](matches._replace(valid=valid))
-    assert not np.any(believed & ~valid)
-    assert not np.any(compiled[name](matches._replace(valid=jnp.zeros(M, bool))))
-
-
-def test_the_order_of_the_matches_does_not_matter():
-    matches, _ = found(np.random.default_rng(4), 0.3)
-    order = np.random.default_rng(5).permutation(M)
-    S = matches.covariance[order][:, :, order]
-    for name in AGREEING:
-        believed = np.asarray(compiled[name](matches))
-        valid, landmark = matches.valid[order], matches.landmark[order]
-        permuted = compiled[name](Candidates(matches.residual[order], S, valid, landmark))
-        np.testing.assert_array_equal(permuted, believed[order])
-
-
 def jointly_compatible(matches, kept):
     index = np.flatnonzero(np.repeat(kept, 2))
     S = np.asarray(matches.covariance).reshape(2 * M, 2 * M)[np.ix_(index, index)]
@@ -155,22 +138,6 @@ def test_joint_compatibility_finds_the_largest_set_there_is():
         assert jointly_compatible(matches, believed)
 
 
-def independent(squares):
-    """Matches that have nothing to do with one another, each so far off, squared."""
-    r = jnp.zeros((M, 2)).at[: len(squares), 0].set(jnp.sqrt(jnp.asarray(squares)))
-    S = jnp.asarray(np.eye(2 * M).reshape(M, 2, M, 2))
-    return Candidates(r, S, jnp.arange(M) < len(squares), jnp.arange(M))
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_joint_compatibility_is_bounded_by_the_numbers_of_all_that_are_in(count):
-    """χ² of 2 for each: just below it all are believed, and just above one is not."""
-    bound = chi2.ppf(GATE, 2 * count)
-    for times, believed in ((0.999, count), (1.001, count - 1)):
-        matches = independent(np.full(count, times * bound / count))
-        assert np.sum(compiled["jcbb"](matches)) == believed
-
-
 def test_ransac_rescues_what_only_all_of_low_innovation_together_explain():
     """Residuals are θ + d φ, φ at four of its σ. Eighteen matches of small d hardly feel φ and
     agree with one another. That of d = 10 fits none of them alone, but it fits them together, as
@@ -186,15 +153,6 @@ def test_ransac_rescues_what_only_all_of_low_innovation_together_explain():
     apart = np.asarray(association._distances_given_one(matches))
     assert (apart[:18, 18] > matches.gate).all()
     assert compiled["ransac"](matches).tolist() == [True] * 19 + [False]
-
-
-@pytest.mark.parametrize("seed", [19, 58, 90])
-def test_a_first_match_that_was_wrong_does_not_stay_nor_what_it_kept_out(seed):
-    matches, bad = found(np.random.default_rng(seed), 0.3)
-    first = np.flatnonzero(bad)[0]
-    believed = np.asarray(jax.jit(association._grown_from)(matches, first))
-    assert not believed[bad].any()
-    assert believed[~bad].mean() > 0.9
 
 
 def test_sequential_ends_with_matches_that_all_fit_the_others():
@@ -228,20 +186,6 @@ def matched():
 
     state, pixels = quick_jit(predicted)(case.frames(0)[0])
     return slam, state, control, pixels
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", AGREEING)
-def test_what_the_filter_does_not_know_is_no_outlier(name):
-    """All are off by one turn of the camera: each explains the others, but not the stranger."""
-    slam, state, control, pixels = matched()
-    offsets = np.tile([4.0, 0.0], (6, 1))
-    offsets[2] = [-30.0, 20.0]
-    seen = Features(jnp.arange(6), pixels + jnp.asarray(offsets), jnp.ones(6, bool))
-    believed = quick_jit(
-        lambda state, seen: ASSOCIATIONS[name](candidates(slam, state, control, seen))
-    )
-    assert believed(state, seen).tolist() == [True, True, False, True, True, True]
 
 
 def test_a_tolerance_is_noise_of_each_match_by_itself():
@@ -280,37 +224,19 @@ def test_a_split_counts_what_it_costs_in_the_noise_that_is_predicted():
     np.testing.assert_allclose(constant, own * there[0], rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_of_a_curved_measurement_the_spread_of_a_moving_camera_is_told():
-    """Against samples: what a linear prediction leaves out of each match's covariance."""
+def test_the_spread_of_a_curved_measurement_is_by_second_derivatives():
+    """Which are those of differences, by a landmark's own numbers; `½ tr(H P H P)` is added."""
     slam, state, control, pixels = matched()
-    seen = Features(jnp.arange(6), pixels, jnp.ones(6, bool))
-    linear, curved = (candidates(slam, state, control, seen, curved=x) for x in (False, True))
-    added = np.asarray(curved.covariance - linear.covariance)
-    own = added[np.arange(6), :, np.arange(6)]
-    rest = added.copy()
-    rest[np.arange(6), :, np.arange(6)] = 0.0
-    np.testing.assert_array_equal(rest, 0.0)
-    assert np.all(np.linalg.eigvalsh(own) >= -1e-12)
-    hessian, Q = curvature(slam.model, state, jnp.arange(6), context_of(slam, control))
-    rng = np.random.default_rng(0)
-    for H, P, extra in zip(np.asarray(hessian), np.asarray(Q), own, strict=True):
-        root = np.linalg.cholesky(P + 1e-15 * np.trace(P) * np.eye(len(P)))
-        draws = rng.normal(size=(200_000, len(P))) @ root.T
-        bent = np.einsum("pij,ni,nj->np", H, draws, draws) / 2
-        np.testing.assert_allclose(np.cov(bent.T), extra, atol=0.05 * np.trace(extra))
-
-
-def test_the_second_derivatives_of_a_measurement_are_those_of_differences():
-    """By a landmark's own numbers, whose covariance is the state's."""
-    slam, state, control, _ = matched()
     at, k = context_of(slam, control), 2
 
     def run(state, steps):
         context = slam.model.given(state.core, at)
         view, landmark = slam.model.view(state.core, context), state.landmarks[k]
         measured = jax.vmap(lambda step: slam.model.observe(view, landmark + step, context)[0])
-        return *curvature(slam.model, state, jnp.arange(6), at), measured(steps)
+        seen = Features(jnp.arange(6), pixels, jnp.ones(6, bool))
+        more, less = (candidates(slam, state, control, seen, curved=x) for x in (True, False))
+        added = more.covariance - less.covariance
+        return *curvature(slam.model, state, jnp.arange(6), at), measured(steps), added
 
     d, c = state.landmarks.shape[1], state.core_dim
     sizes = 1e-3 * np.maximum(1.0, np.abs(np.asarray(state.landmarks[k])))
@@ -318,27 +244,13 @@ def test_the_second_derivatives_of_a_measurement_are_those_of_differences():
     pairs = np.concatenate(
         [one * steps[:, None] + other * steps for one in (1, -1) for other in (1, -1)]
     ).reshape(4 * d * d, d)
-    hessian, Q, values = quick_jit(run)(state, pairs)
+    hessian, Q, values, added = quick_jit(run)(state, pairs)
     both, more, less, neither = np.asarray(values).reshape(4, d, d, -1)
     expected = (both - more - less + neither) / (4 * sizes[:, None, None] * sizes[:, None])
     found = np.moveaxis(hessian[k][:, -d:, -d:], 0, -1)
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
     own = slice(c + k * d, c + (k + 1) * d)
     np.testing.assert_allclose(Q[k][-d:, -d:], state.covariance[own, own], rtol=1e-9, atol=1e-15)
-
-
-class WithoutCovariance(Around):
-    """A filter that does not say how its innovations are correlated."""
-
-    def update(self, state, control, seen):
-        after, innovation = super().update(state, control, seen)
-        return after, replace(innovation, covariance=None)
-
-
-def test_a_filter_without_the_covariance_of_its_innovations_is_refused():
-    case = Case("matched-6dof", steps=1, landmarks=6)
-    slam, control, first = matched()[0], case.controls()[0], case.frames(0)[0]
-    slam = WithoutCovariance(slam)
-    state = jax.eval_shape(lambda: slam.predict(slam.init(case.capacity, first), control))
-    with pytest.raises(ValueError, match="innovations have no covariance"):
-        jax.eval_shape(lambda state: candidates(slam, state, control, first), state)
+    spread = np.einsum("mpij,mjk,mqkl,mli->mpq", hessian, Q, hessian, Q) / 2
+    expected = np.einsum("mn,mpq->mpnq", np.eye(6), spread)
+    np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-9 * spread.max())

@@ -2,11 +2,9 @@
 
 from functools import cache, partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from cases import Case, quick_jit
 
 import jaxslam
@@ -50,28 +48,3 @@ def test_what_is_collected_is_ones_own():
     own = partial(jaxslam.run, slam, output=lambda state, innovation, frame: frame.control + 1)
     _, found = jax.eval_shape(own, frames_of(), slam.init(3))
     assert found.shape == case().controls().shape
-
-
-class NothingLeaves(jaxslam.AbstractFilter):
-    """A filter that keeps every landmark: it asks another, which could remove them."""
-
-    estimator: jaxslam.Slam
-
-    def init(self, capacity, first=None, known=None):
-        return self.estimator.init(capacity, first, known)
-
-    def step(self, state, control, seen, new):
-        return self.estimator.step(state, control, seen, new)
-
-    def marginal(self, state, function):
-        return self.estimator.marginal(state, function)
-
-    def landmark_marginal(self, state, function, slots):
-        return self.estimator.landmark_marginal(state, function, slots)
-
-
-def test_slots_are_not_freed_of_a_filter_that_cannot_remove():
-    slam, frames = NothingLeaves(case().filter("world")), frames_of()
-    with pytest.raises(ValueError, match=r"NothingLeaves has no remove\(state, gone\)"):
-        jaxslam.run(slam, frames_of(jnp.zeros((4, 3), bool)), slam.init(3))
-    assert eqx.filter_eval_shape(jaxslam.run, slam, frames, slam.init(3))

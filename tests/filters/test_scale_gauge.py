@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, pose_run, quick_jit
+from cases import Case, quick_jit, run_filter
 
 from jaxslam.models.scale import ScaleGauge, velocity_in_gauge
 
@@ -44,11 +44,8 @@ def assert_moments(draws, mean, covariance, also=0.0):
     ("velocity", "sigma", "n"),
     [
         ((1.2, 0, 0), (0.1, 0.1, 0.05), 2),
-        ((0, 1.2, 0.3), (0.1, 0.1, 0.05), 2),
-        ((1.2, 0, 0.6), (0.1, 0.1, 0.02), 2),
         ((0.7, -0.4, 0.6), (0.3, 0.3, 0.2), 2),
         ((0, 1.2, 2.0), (0.5, 0.5, 0.5), 2),
-        ((1.2, 0, 0.3, 0.5, -1, 0.2), (0.1, 0.1, 0.1, 0.05, 0.05, 0.05), 3),
         ((0.3, 0.8, -0.5, 1, 2, -3), (0.2, 0.2, 0.2, 0.3, 0.3, 0.3), 3),
     ],
 )
@@ -102,10 +99,9 @@ def test_an_inverse_depth_has_its_exact_moments_in_the_unit_of_the_state(varianc
     np.testing.assert_allclose(left, np.sqrt(square - mean**2 * (1 + variance)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["matched-loose", "matched-turn-loose", "matched-6dof-loose"])
-def test_a_new_landmark_has_the_moments_of_its_prior(name):
+def test_a_new_landmark_has_the_moments_of_its_prior():
     """Drawn after frame 0: `e^λ ω`, which the filter holds, exactly, ω to second order in λ."""
-    of = Case(name, landmarks=5)
+    of = Case("matched-6dof-loose", landmarks=5)
     slam = of.filter("scale_gauge")
     state = quick_jit(partial(slam.init, of.capacity))(of.frames(0)[0])
     c, d = state.core_dim, state.landmarks.shape[1]
@@ -136,8 +132,10 @@ def test_a_metre_that_is_not_known_is_in_the_metric_covariance_and_nowhere_else(
     of = Case("matched-turn", 1, steps=8)
     slam = of.filter("scale_gauge")
     unknown = replace(slam, depth=replace(slam.depth, unit=0.4))
-    _, (known, P, nis, _) = pose_run(of, slam)
-    _, (poses, wide, same_nis, _) = pose_run(of, unknown)
+    (known, P, _, nis), (poses, wide, _, same_nis) = (
+        quick_jit(partial(run_filter, of.capacity, x))(of.controls(), *of.frames(0))[1]
+        for x in (slam, unknown)
+    )
     np.testing.assert_allclose(same_nis, nis, rtol=1e-9)
     np.testing.assert_allclose(poses.parameters(), known.parameters(), atol=1e-12)
     pose = jax.tree.map(lambda x: x[-1], poses)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import crossed, quick_jit
+from cases import quick_jit
 
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.minimise import started
@@ -65,12 +65,7 @@ def test_the_first_and_the_newest_frame_stay(frames, stride, stay):
     assert kept(frames, stride).tolist() == list(stay)
 
 
-@crossed(
-    ("frames", "treatment"),
-    [FRAMES, FRAMES + 1],
-    [Known, White],
-    quick=[(FRAMES, Known), (FRAMES + 1, White)],
-)
+@pytest.mark.parametrize(("frames", "treatment"), [(FRAMES, Known), (FRAMES + 1, White)])
 def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames, treatment):
     """Twice over, so that steps of different lengths are merged too."""
     slam, record = filter_of(treatment), full(frames)
@@ -93,22 +88,6 @@ def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames
     count = len(stay)
     ends = [k for k in stay if k < count]
     np.testing.assert_allclose(there[: len(ends)], after.motion[np.array(ends)], atol=1e-12)
-
-
-def test_the_variance_that_merged_steps_add_to_the_velocity_is_that_of_both():
-    slam, record = filter_of(), replace(full(), controls=jnp.full(FRAMES - 1, 0.1))
-    fewer, _ = thinned(slam, record, unknowns(slam, record))
-
-    def added(of):
-        def velocity(x):
-            return quick_jit(path)(slam, of, x).motion[of.last]
-
-        J = jax.jacfwd(velocity)(jnp.zeros(PathLayout.of(slam).size(FRAMES)))[
-            :, PathLayout.of(slam).whole :
-        ]
-        return J @ J.T
-
-    np.testing.assert_allclose(added(fewer), added(record), atol=1e-12)
 
 
 @pytest.mark.parametrize("restart", [1, 2])
@@ -152,15 +131,13 @@ def test_a_window_is_tied_while_frames_that_stay_share_half_of_their_landmarks(l
     measured, first = jnp.zeros((*seen.shape, 2)), jnp.maximum(j, 0)
     record = whole(jnp.full(FRAMES - 1, 0.1), measured, seen, first)
     assert bool(tied(record)) == holds
-
-
-def test_a_frame_without_light_unties_nothing():
-    record = full()
+    record = full()  # and a frame without light unties nothing
     assert tied(replace(record, seen=record.seen.at[4].set(False)))
 
 
-@pytest.mark.parametrize("treatment", [Known, White])
-@pytest.mark.parametrize(("last", "stride"), [(6, 1), (6, 2), (5, 3), (4, 3)])
+@pytest.mark.parametrize(
+    ("last", "stride", "treatment"), [(6, 1, Known), (6, 2, White), (5, 3, Known), (4, 3, White)]
+)
 def test_what_a_coarse_window_says_comes_back_as_the_likeliest_of_the_whole_one(
     last, stride, treatment
 ):

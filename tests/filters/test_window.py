@@ -17,14 +17,7 @@ from scipy.stats import chi2, norm
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
-from jaxslam.filters.window.problem import (
-    PathLayout,
-    left_out,
-    path,
-    reduced,
-    residuals,
-    sensitivities,
-)
+from jaxslam.filters.window.problem import PathLayout, left_out, path, reduced, residuals
 from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
 from jaxslam.filters.window.to_filter import _with_metre, gauge_state
@@ -32,7 +25,7 @@ from jaxslam.filters.words import scenario_pieces
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import InverseScaling
 from jaxslam.linalg import cholesky
-from jaxslam.models.calibration import Considered, Estimated, Known, White
+from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features
 from jaxslam.models.scale import ScaleGauge
@@ -85,26 +78,7 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
     return Case(slam, replace(record, measured=measured), x, y)
 
 
-CASES = [
-    ("standstill", Known, None),
-    ("standstill", White, 0.5),
-    ("standstill", Estimated, 0.5, 3),
-    ("standstill-6dof", White, None, 3),
-    ("standstill-6dof", Estimated, 0.5),
-]
-
-
-def each(cases, quick=CASES):
-    """A test of each of these cases, of which others than the `quick` ones are slow."""
-
-    def name(of):
-        return "-".join(getattr(part, "__name__", str(part)) for part in of)
-
-    given = [pytest.param(of, marks=() if of in quick else pytest.mark.slow) for of in cases]
-    return pytest.mark.parametrize("of", given, ids=name)
-
-
-each_case = each(CASES, quick=[CASES[1], CASES[4]])
+PLANE, SPACE = ("standstill", Estimated, 0.5, 3), ("standstill-6dof", White)
 
 
 def all_residuals(slam, record, u, shape):
@@ -159,25 +133,21 @@ def features(slots, measured, valid=None):
     return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid))
 
 
-@cache
+@quick_jit
 def some_record():
     """Three frames, three slots: 0 and 1 begin in frame 0, slot 2 in frame 1."""
-    return quick_jit(_some_record)()
-
-
-def _some_record():
     record = empty(pieces("standstill")["motion"], 3, 3, 1, jnp.float64)
     record = begun(record, features([1, 0, 2], [11.0, 10.0, 99.0], [True, True, False]))
     record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]), jnp.eye(1))
     record = begun(record, features([2], [22.0]))
-    return stepped(
-        record, jnp.asarray(0.2), features([2, 0], [32.0, 30.0], [True, False]), jnp.eye(1)
-    )
+    seen = features([2, 0], [32.0, 30.0], [True, False])
+    return stepped(record, jnp.asarray(0.2), seen, jnp.eye(1))
 
 
 def test_a_record_has_every_measurement_by_frame_and_slot():
     record = some_record()
     assert record.last == 2
+    assert not record.standing  # as it moved at once
     np.testing.assert_array_equal(record.controls, [0.1, 0.2])
     np.testing.assert_array_equal(record.first, [0, 0, 1])
     seen = [[True, True, False], [True, True, True], [False, False, True]]
@@ -188,20 +158,26 @@ def test_a_record_has_every_measurement_by_frame_and_slot():
     np.testing.assert_array_equal(record.compared, compared)
 
 
-def test_a_full_record_stays_as_it_is():
+def test_a_slot_of_a_record_is_used_again_removed_and_kept_where_all_is_full():
     record = some_record()
     assert record.full
     after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]), jnp.eye(1))
     jax.tree.map(np.testing.assert_array_equal, after, record)
+    after = removed(begun(record, features([0], [50.0])), jnp.array([False, True, False]))
+    assert after.first[0] == 2
+    np.testing.assert_array_equal(after.seen[:, 0], [False, False, True])
+    assert after.measured[2, 0, 0] == 50
+    assert not after.seen[:, 1].any()
+    np.testing.assert_array_equal(after.seen[:, 2], record.seen[:, 2])
+    less = record.cut(2)
+    assert (less.frames, int(less.last), less.controls.shape) == (2, 1, (1,))
+    np.testing.assert_array_equal(less.seen, record.seen[:2])
+    np.testing.assert_array_equal(less.measured, record.measured[:2])
 
 
-@cache
+@quick_jit
 def standing_then_moving():
     """Slots 0 and 1 since frame 0, slot 2 since the second frame in which nothing moved."""
-    return quick_jit(_standing_then_moving)()
-
-
-def _standing_then_moving():
     record = empty(pieces("standstill")["motion"], 4, 3, 1, jnp.float64)
     record = begun(record, features([0, 1], [10.0, 20.0]))
     records = []
@@ -214,11 +190,13 @@ def _standing_then_moving():
     ]:
         record = begun(stepped(record, jnp.asarray(0.1), there, jnp.eye(1)), new)
         records.append(record)
-    return records
+    unseen = features([0, 1], [11.0, 19.0], [False, False])
+    return records, stepped(records[0], jnp.asarray(0.1), unseen, jnp.eye(1))
 
 
 def test_while_nothing_moves_the_newest_frame_takes_the_place_of_the_one_before():
-    first, second, third, *_ = standing_then_moving()
+    """With the first motion the velocity is drawn anew; nothing seen is no rest."""
+    (first, second, third, moved, after), unseen = standing_then_moving()
     for record in (first, second, third):
         assert record.standing
         assert record.last == 1
@@ -227,31 +205,15 @@ def test_while_nothing_moves_the_newest_frame_takes_the_place_of_the_one_before(
     np.testing.assert_array_equal(third.seen[1], [True, False, True])
     np.testing.assert_array_equal(third.measured[1, [0, 2], 0], [10.5, 30.5])
     np.testing.assert_array_equal(third.first, [0, 0, 1])
-
-
-def test_with_the_first_motion_the_velocity_is_drawn_anew():
-    *_, moved, after = standing_then_moving()
     assert not moved.standing
-    assert moved.last == 2
-    np.testing.assert_array_equal(moved.restarted, [False, True, False])
-    np.testing.assert_array_equal(after.restarted, [False, True, False])
-    assert after.last == 3
-
-
-def test_a_frame_in_which_nothing_is_seen_does_not_say_that_the_camera_stands():
-    first, *_ = standing_then_moving()
-    unseen = features([0, 1], [11.0, 19.0], [False, False])
-    assert not stepped(first, jnp.asarray(0.1), unseen, jnp.eye(1)).standing
-
-
-def test_what_moved_at_once_never_stood():
-    record = some_record()
-    assert not record.standing
-    assert not record.restarted.any()
+    assert (moved.last, after.last) == (2, 3)
+    for record in (moved, after):
+        np.testing.assert_array_equal(record.restarted, [False, True, False])
+    assert not unseen.standing
 
 
 def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
-    slam, record, x, _ = case("standstill-6dof", White, None, 3)
+    slam, record, x, _ = case(*SPACE)
     record = replace(record, restarted=record.restarted.at[1].set(True))
     layout = PathLayout.of(slam)
     own = slice(layout.whole + layout.step + layout.each, None)
@@ -268,34 +230,11 @@ def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
     np.testing.assert_array_equal(other.motion[2], there.motion[2])
 
 
-def test_a_slot_that_is_used_again_forgets_its_old_track():
-    record = begun(some_record(), features([0], [50.0]))
-    assert record.first[0] == 2
-    np.testing.assert_array_equal(record.seen[:, 0], [False, False, True])
-    assert record.measured[2, 0, 0] == 50
-    np.testing.assert_array_equal(record.seen[:, 1:], some_record().seen[:, 1:])
-
-
-def test_what_is_removed_is_not_seen():
-    record = removed(some_record(), jnp.array([False, True, False]))
-    assert not record.seen[:, 1].any()
-    np.testing.assert_array_equal(record.seen[:, ::2], some_record().seen[:, ::2])
-
-
-def test_a_record_is_cut_to_its_first_frames():
-    record = some_record().cut(2)
-    assert (record.frames, int(record.last), record.controls.shape) == (2, 1, (1,))
-    np.testing.assert_array_equal(record.seen, some_record().seen[:2])
-    np.testing.assert_array_equal(record.measured, some_record().measured[:2])
-
-
 # The quadratic
 
 
-@pytest.mark.slow
-@each_case
-def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem(of):
-    slam, record, x, y = case(*of)
+def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem():
+    slam, record, x, y = case(*PLANE)
     x, y = x + 0.1, y - 0.1
     got = quick_jit(reduced)(slam, record, x, y)
     _, A, g = dense(slam, record, x, y)
@@ -311,55 +250,17 @@ def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem(of):
     close(roots @ roots.transpose(0, 2, 1), own, 1e-8)
 
 
-@pytest.mark.slow
-@each_case
-def test_sensitivities_are_the_derivatives_of_the_path(of):
-    slam, record, x, _ = case(*of)
-
-    @quick_jit
-    def both(x):
-        at = path(slam, record, x)
-
-        def of_frame(k):
-            def frame(x):
-                whole = path(slam, record, x)
-                return jax.tree.map(lambda leaf: leaf[k], (whole.frames, whole.motion))
-
-            return jacobian(frame, x)
-
-        return sensitivities(slam, record, x, at), jnp.stack([of_frame(k) for k in range(FRAMES)])
-
-    got, expected = both(x)
-    a = got.frame.shape[1]
-    close(got.frame, expected[:, :a], 1e-8)
-    close(got.motion, expected[:, a:], 1e-8)
-
-
 # Minima
 
 
-@pytest.mark.slow
-@each_case
-def test_a_minimum_costs_less_than_the_truth_and_has_no_gradient(of):
-    slam, record, x, y = case(*of)
-    at = minimum(*of)
-    r, A, g = dense(slam, record, at.x, at.y)
-    truth, *_ = dense(slam, record, x, y)
-    np.testing.assert_allclose(at.cost, r @ r, rtol=1e-9)
-    assert at.cost < truth @ truth
-    # What a Newton step would still gain.
-    assert g @ np.linalg.solve(A, g) < 1e-9
-
-
-@each(CASES[1:3], quick=CASES[2:3])
-def test_a_minimum_is_found_within_the_tolerance(of):
+def test_a_minimum_is_found_within_the_tolerance():
     """Of half the sum of squares, and in far fewer steps than are allowed."""
-    slam, record, x, y = case(*of)
+    slam, record, x, y = case(*PLANE)
     start = started(0.9 * x, y)
     found, _ = quick_jit(lambda record, start: minimised(slam, record, start, 60))(record, start)
     assert found.converged
     assert found.damping < 1
-    assert found.cost - minimum(*of).cost < 10 * minimise.TOLERANCE
+    assert found.cost - minimum(*PLANE).cost < 10 * minimise.TOLERANCE
 
 
 @pytest.mark.parametrize(
@@ -433,62 +334,42 @@ def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
 # Scale
 
 
-@each_case
-def test_all_lengths_enlarged_show_the_same_pixels(of):
+@pytest.mark.parametrize("of", [PLANE, SPACE], ids=["plane", "space"])
+def test_scaling_changes_no_pixel_and_is_an_eigenvector_of_the_information_with_value_1(of):
+    """And orthogonal to the gradient wherever that is zero. Without common errors it is the
+    derivative of what is rescaled; with them the shortest of those that change no pixel."""
     slam, record, *_ = case(*of)
     at = minimum(*of)
 
     @quick_jit
-    def wrong(log_scale):
+    def enlarged(log_scale):
         x, y = rescaled(slam, record, at, log_scale)
         there = path(slam, record, x)
-        return residuals(slam, record, there, y), there.frames.pose.translation()
+        return (x, y), residuals(slam, record, there, y), there.frames.pose.translation()
 
-    (same, near), (other, far) = wrong(0.0), wrong(0.3)
+    (_, same, near), (_, other, far) = enlarged(0.0), enlarged(0.3)
     np.testing.assert_allclose(other, same, atol=1e-9)
     np.testing.assert_allclose(far, np.exp(0.3) * near, rtol=1e-9, atol=1e-12)
-
-
-@each_case
-def test_scaling_is_an_eigenvector_of_the_information_with_value_1(of):
-    """And orthogonal to the gradient wherever that is zero."""
-    slam, record, *_ = case(*of)
-    at = minimum(*of)
     s = quick_jit(scaling)(slam, record, at)
     both = np.append(s.x, s.y.ravel())
     np.testing.assert_allclose(s.squared, both @ both, rtol=1e-12)
     _, A, g = dense(slam, record, at.x, at.y)
     np.testing.assert_allclose(A @ both, both, atol=1e-6 * float(np.linalg.norm(both)))
     assert abs(g @ both) < 1e-5 * np.linalg.norm(both)
+    assert g @ np.linalg.solve(A, g) < 1e-9  # what a Newton step would still gain
+    if of is SPACE:
+        for one, more, less in zip(s, enlarged(1e-5)[0], enlarged(-1e-5)[0], strict=False):
+            np.testing.assert_allclose(one, (more - less) / 2e-5, atol=1e-7)
+    else:  # what changes no depth: the common error up, and every own one down
+        p, start = slam.sensor.size, PathLayout.of(slam).start
+        free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common
+        assert abs(free) < 1e-9 < 1e-3 < abs(s.x[start])
 
 
-def test_scaling_is_the_derivative_of_what_is_rescaled():
-    """Where no error is common: there it is the shortest of those that change no pixel."""
-    slam, record, *_ = case("standstill-6dof", White, None, 3)
-    at = minimum("standstill-6dof", White, None, 3)
-    wide = quick_jit(lambda log_scale: rescaled(slam, record, at, log_scale))
-    s = quick_jit(scaling)(slam, record, at)
-    for one, more, less in zip(s, wide(1e-5), wide(-1e-5), strict=True):
-        np.testing.assert_allclose(one, (more - less) / 2e-5, atol=1e-7)
-
-
-def test_of_common_errors_scaling_is_the_shortest():
-    slam, record, *_ = case("standstill", White, 0.5)
-    at = minimum("standstill", White, 0.5)
-    s = quick_jit(scaling)(slam, record, at)
-    # What changes no depth: the common error up, and every own one down.
-    p, start = slam.sensor.size, PathLayout.of(slam).start
-    free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common
-    assert abs(free) < 1e-9
-    assert abs(s.x[start]) > 1e-3
-
-
-@pytest.mark.slow
-@each([CASES[3], CASES[4]])
-def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
+def test_the_mean_is_shifted_by_the_volume_of_the_rest():
     """`½ d log det A/dλ`, against differences of it; the prior balances that at the shift."""
-    slam, record, *_ = case(*of)
-    at = minimum(*of)
+    slam, record, *_ = case(*PLANE)
+    at = minimum(*PLANE)
     local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
     longer = quick_jit(partial(rescaled, slam, record, at))
 
@@ -517,13 +398,11 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
 # What the filter goes on from
 
 
-@pytest.mark.slow
-@each(CASES[2:4])
-def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
+def test_the_filters_state_is_the_gaussian_of_the_mode(monkeypatch):
     """Marginals in metres are those of the dense inverse; λ has the variance 1/|s|²."""
     monkeypatch.setattr(scale, "MOST_SHIFT", 0.0)
-    slam, record, *_ = case(*of)
-    at = minimum(*of)
+    slam, record, *_ = case(*PLANE)
+    at = minimum(*PLANE)
     m, p = FIRST.size, slam.sensor.size
 
     @quick_jit
@@ -577,57 +456,9 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
 
 
-@pytest.mark.slow
-def test_a_calibration_that_is_considered_is_found_by_the_window_and_then_left():
-    slam, record, *_ = case(*CASES[2])
-    at, m = minimum(*CASES[2]), FIRST.size
-    considered = replace(slam, calibration=Considered(slam.calibration.sigma))
-
-    @quick_jit
-    def handed(at, treated, measured):
-        every = jnp.arange(m)
-        first = Features(every, record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(treated, record, *mean(treated, record, at), treated.init(m, first))
-        seen = Features(every, measured, jnp.ones(m, bool))
-        return state, treated.step(state, jnp.asarray(0.2), seen, first)[0]
-
-    measured = record.measured[record.last] + 1.0
-    (estimated, moved), (found, left) = (handed(at, x, measured) for x in (slam, considered))
-    part = found.core.part("calibration")
-    np.testing.assert_allclose(found.core.calibration, estimated.core.calibration, rtol=1e-9)
-    np.testing.assert_allclose(found.covariance, estimated.covariance, atol=1e-12)
-    assert np.abs(found.core.calibration).max() > 1e-3
-    np.testing.assert_array_equal(left.core.calibration, found.core.calibration)
-    np.testing.assert_allclose(left.covariance[part, part], found.covariance[part, part])
-    assert np.abs(moved.core.calibration - found.core.calibration).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_the_filters_state_stands_at_the_mean_of_the_scale():
-    """As that of a mode all of whose lengths are so much longer."""
-    slam, record, *_ = case(*CASES[1])
-    at, m = minimum(*CASES[1]), FIRST.size
-
-    @quick_jit
-    def handed(at, shift):
-        first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(slam, record, *mean(slam, record, at, shift), slam.init(m, first))
-        pose, covariance = slam.marginal(state, lambda view: view.pose)
-        return jnp.log(jnp.linalg.norm(pose.translation())), covariance
-
-    zero, shift = jnp.zeros(()), jnp.asarray(0.1)
-    x, y = quick_jit(rescaled)(slam, record, at, shift)
-    found, expected = handed(at, shift), handed(replace(at, x=x, y=y), zero)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-12)
-    # What the rest makes of that takes some of it back.
-    assert 0.5 * shift < found[0] - handed(at, zero)[0] < shift
-
-
-@each(CASES[1:2])
-def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown(of):
-    slam, record, *_ = case(*of)
-    at = minimum(*of)
+def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown():
+    slam, record, *_ = case(*PLANE)
+    at = minimum(*PLANE)
     start = jax.tree.map(lambda leaf: leaf[None], started(at.x, at.y))
     given = jax.tree.map(lambda leaf: leaf[0], modes._candidates(start, jnp.ones(1, int)))
     found = quick_jit(lambda *of: modes._minimum(slam, *of))(given, record)
@@ -637,11 +468,10 @@ def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown(of):
 
 
 @pytest.mark.slow
-@each([CASES[1], CASES[4]])
-def test_what_a_minimum_gains_without_a_landmark_is_foretold(of):
+def test_what_a_minimum_gains_without_a_landmark_is_foretold():
     """The other minimum is found, and its cost compared."""
-    slam, record, *_ = case(*of)
-    at = minimum(*of)
+    slam, record, *_ = case(*PLANE)
+    at = minimum(*PLANE)
 
     @quick_jit
     def foretold(record, at):
@@ -690,26 +520,6 @@ def test_minima_are_one_by_the_information_of_the_better(better, worse, count):
 
     found, _ = modes._likeliest(weighed, case()[1], at, jnp.ones(2, bool), 2)
     assert np.isfinite(found.log_weights).sum() == count
-
-
-@pytest.mark.slow
-def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():
-    slam, record, x, y = case("standstill-6dof", White, None, 3)
-    unknown = replace(slam, depth=replace(slam.depth, unit=0.4))
-    at, m = started(x, y), FIRST.size
-    first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
-
-    def covariance(slam):
-        state = gauge_state(slam, record, *mean(slam, record, at), slam.init(m, first))
-        return state.covariance, state.core.part("log_scale").stop - 1
-
-    (P, _), (wide, place) = (
-        quick_jit(lambda slam=slam: covariance(slam))() for slam in (slam, unknown)
-    )
-    np.testing.assert_allclose(wide[place, place], 0.16, rtol=1e-12)
-    assert not np.delete(wide[place], place).any()
-    rest = np.delete(np.delete(wide, place, 0), place, 1)
-    np.testing.assert_allclose(rest, P, atol=1e-12)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -1,29 +1,24 @@
 """A chain of submaps against the one Gaussian of everything."""
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_rows
 
-from jaxslam.consistency import run_through
 from jaxslam.filters.run import Frames, run
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps import chain as chains
+from jaxslam.filters.submaps import closing
 from jaxslam.filters.submaps.chain import base_poses, chain
-from jaxslam.filters.submaps.closing import posterior
-from jaxslam.filters.words import make_filter, scenario_pieces
-from jaxslam.geometry import difference
+from jaxslam.filters.submaps.closing import Loops, agreeing, close, posterior
 from jaxslam.landmarks import Cartesian
 from jaxslam.models.frame import Submaps
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity, Features
 from jaxslam.models.sensors import Position
-from jaxslam.simulation import Room, scenario, simulate
 
 FRAMES, LIFE, SLOTS, DT = 60, 6, 3, 0.2
 """Landmark j is seen from frame 2 j on, so many frames; it has slot j % 3."""
@@ -49,7 +44,7 @@ class Linear:
             v = v + ACCELERATION * DT * rng.normal(size=2)
             positions.append(positions[-1] + DT * v)
         self.points = np.array(positions)[::2] + rng.uniform(-3, 3, (LANDMARKS, 2))
-        self.points[-3] = self.points[1]  # the loop
+        self.points[[-3, -4]] = self.points[[1, 2]]  # the loops
         age = np.arange(FRAMES)[:, None] - 2 * np.arange(LANDMARKS)
         self.seen = (age >= 0) & (age < LIFE)
         noise = SIGMA * rng.normal(size=(FRAMES, LANDMARKS, 2))
@@ -172,12 +167,11 @@ def place_of(chain, number):
     return submaps[0], slots[0]
 
 
-@pytest.mark.parametrize("closed", quick_rows(1, [True, False]))
-def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed, closed):
-    """Cameras and landmarks of long ago, what was measured since then included."""
+def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed):
+    """Cameras and landmarks of long ago, what was measured since then included; and a loop."""
     chained, ended = smoothed
     assert len(ended) >= 8
-    sigma, pairs = 0.01, [(1, LANDMARKS - 3)] if closed else []
+    sigma, pairs = 0.01, [(1, LANDMARKS - 3)]
     places = [[place_of(chained, j) for j in pair] for pair in pairs]
 
     def residual(states):
@@ -192,30 +186,34 @@ def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed, closed):
         np.asarray(covariance)[np.ix_(mine, mine)], P[np.ix_(theirs, theirs)], atol=1e-11
     )
     assert after.converged
+    # The covariances of all cameras, in one pass, are those of each.
+    poses, P = after.cameras()
+    np.testing.assert_allclose(poses.translation().ravel(), value[: 2 * len(P)], atol=1e-12)
+    each = [covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(P))]
+    np.testing.assert_allclose(P[:, :2, :2], each, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_a_chain_ends_where_the_filter_is_however_well_some_directions_are_known():
-    """A car drives straight on. The chain, of one linearisation, does not carry on what the filter
-    has of others: without `LINEARISATION` its end is off by .1 in squared σ, and its σ of the
-    direction by half."""
-    noise = {"velocity_sigma": [0.3] * 3 + [0.05] * 3, "acceleration_sigma": [1.0] * 3 + [0.3] * 3}
-    road = scenario(
-        "handheld", noise, rate=10.0, steps=150, landmarks=12, depth_range=[5.0, 50.0],
-        velocity=[0.0, 0.0, 8.0, 0.0, 0.0, 0.0], nearest_depth=5.0,
-    )  # fmt: skip
-    base: Any = make_filter("scale_gauge+oc+scene50", **scenario_pieces(road))
-    slam, room = replace(base, frame=Submaps(12, 32)), Room(12, 12, 12, 12)
-
-    def end():
-        state, _ = run_through(slam, room, simulate(road, jax.random.key(2)), lambda *_: None)
-        chained = chain(slam, state, slam.frame.history)
-        nothing = jnp.zeros((1, *chained.shape))
-        return state, chained.cameras(chained.at(nothing[0]), nothing)
-
-    state, (poses, covariances) = jax.jit(end)()
-    _, newest = slam.inner.gaussian(state.inner, None)
-    last = jax.tree.map(lambda x: x[-1], poses)
-    away = np.asarray(difference(last, newest.core.pose.camera_pose()))
-    assert int(state.count) > 15
-    assert away @ np.linalg.solve(np.asarray(covariances[-1]), away) < 0.03
+def test_loops_are_believed_among_wrong_pairs_and_close_the_chain(linear, smoothed, monkeypatch):
+    """And of a chain that is over-confident, as all its pairs are alike; but within `WIDEST`."""
+    chained, ended = smoothed
+    pairs = np.array([(1, LANDMARKS - 3), (2, LANDMARKS - 4), (3, LANDMARKS - 2)])
+    places = np.array([[place_of(chained, j) for j in pair] for pair in pairs])
+    loops = Loops(jnp.asarray(places[..., 0]), jnp.asarray(places[..., 1]), jnp.ones(3, bool))
+    none, right = jnp.zeros(3, bool), jnp.arange(3) < 2
+    before = eqx.filter_jit(close)(chained, replace(loops, valid=none))
+    believed = eqx.filter_jit(agreeing)(before, loops)
+    assert believed.valid.tolist() == [True, True, False]
+    after = eqx.filter_jit(close)(chained, believed)
+    assert after.converged
+    poses, P = after.cameras()
+    mean, covariance = linear.batch([(*pair, 1e-5) for pair in pairs[:2]])
+    np.testing.assert_allclose(poses.translation(), mean.reshape(-1, 2)[ended], atol=1e-6)
+    own = [covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in ended]
+    np.testing.assert_allclose(P[:, :2, :2] / after.unit_variance(), own, atol=1e-6)
+    links = chained.links
+    links = replace(links, root=0.3 * links.root, whitening=links.whitening / 0.3)
+    narrow = eqx.filter_jit(close)(replace(chained, links=links), replace(loops, valid=none))
+    for widest, believes in ((closing.WIDEST, True), (1.0, False)):
+        monkeypatch.setattr(closing, "WIDEST", widest)
+        found = agreeing(narrow, replace(loops, valid=right))
+        assert bool(found.valid[:2].all()) == believes

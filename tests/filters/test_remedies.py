@@ -1,0 +1,377 @@
+"""Tests of the remedies: the gauge, and corrections that respect it in each their own way.
+
+What no measurement tells must stay unknown while estimates change: uncertainty added along it at
+the start changes no estimate ever after.
+"""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, close, named, quick_jit, quick_rows
+
+import jaxslam
+from jaxslam.filters.linear.blocks import composition, minus, observe, placed
+from jaxslam.filters.linear.kalman import Kalman
+from jaxslam.filters.model import COMPOSED, Context
+from jaxslam.filters.remedies.gauge import unobservable_directions
+from jaxslam.filters.remedies.invariant import rigid_directions
+from jaxslam.filters.remedies.transport import read_from, read_scale_too
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.geometry import PLANAR, SPATIAL, exp, jacobian, log
+from jaxslam.landmarks import Cartesian
+from jaxslam.models.sensors import noises
+
+VELOCITY, LANDMARKS = slice(3, 5), slice(7, 11)
+
+
+def test_the_scale_is_read_from_pose_velocity_and_landmarks_and_from_nothing_else():
+    """Of any gauge of three directions and a scale, and any covariance."""
+    draw = np.random.default_rng(0)
+    N, half = draw.normal(size=(12, 4)), draw.normal(size=(12, 12))
+
+    def read(N, P):
+        return read_scale_too(N, read_from(N[:, :3], 3), P, VELOCITY, LANDMARKS)
+
+    L = quick_jit(read)(N, half @ half.T)
+    np.testing.assert_allclose(L @ N, np.eye(4), atol=1e-10)
+    np.testing.assert_array_equal(np.flatnonzero(~np.any(np.abs(L) > 1e-12, axis=0)), [5, 6, 11])
+
+
+def test_the_scale_is_read_from_what_is_known_of_it():
+    """A new landmark says less than old ones; a camera at rest nothing, and one that moves all."""
+    variances = np.full(12, 1e-4)
+    variances[7] = 0.25
+    for speed in (0.0, 1.0):
+        N = np.zeros((12, 4))
+        N[:3, :3], N[3:5, 3], N[7:11, 3] = np.eye(3), speed, 1.0
+        N, P = jnp.asarray(N), jnp.diag(jnp.asarray(variances))
+        read = read_scale_too(N, read_from(N[:, :3], 3), P, VELOCITY, LANDMARKS)
+        np.testing.assert_allclose(read @ N, np.eye(4), atol=1e-12)
+        by_velocity, by_new, by_old = read[-1, VELOCITY].sum(), read[-1, 7], read[-1, 8]
+        assert by_velocity * speed > 0.99 or (by_velocity == 0 and by_new < 0.01 * by_old)
+
+
+@cache
+def case(geometry):
+    """The start of a run without odometry."""
+    return Case({PLANAR: "matched", SPATIAL: "matched-6dof"}[geometry], steps=6, landmarks=5)
+
+
+def run_with_gauge(slam, start, directions):
+    """A filter's run of a case twice: as it is, and with the frame (and the scale) unknown by 0.1
+    at the start; states after every step, their directions N, and NIS."""
+    first, known, new = start.frames(0)
+
+    def run(sigma):
+        state = slam.init(start.capacity, first)
+        N = unobservable_directions(slam.model, state)[:, :directions]
+        state = replace(state, covariance=state.covariance + sigma**2 * N @ N.T)
+
+        def step(state, frame):
+            state, innovation = slam.step(state, *frame)
+            # Where the filter's directions are those of landmarks' first estimates.
+            at = state if state.first is None else replace(state, landmarks=state.first)
+            N = unobservable_directions(slam.model, at)[:, :directions]
+            kept = state.core, state.landmarks, state.covariance
+            return state, (*kept, N, innovation.nis)
+
+        return jax.lax.scan(step, state, (start.controls(), known, new))[1]
+
+    return quick_jit(jax.vmap(run))(jnp.array([0.0, 0.1]))
+
+
+def difference_of_runs(slam, start, directions):
+    """How much the estimates differ between the two runs, and how much the covariances differ
+    from what was added; both relative."""
+    core, landmarks, covariance, N, nis = run_with_gauge(slam, start, directions)
+    estimates = [x for x in jax.tree.leaves((core, landmarks, nis)) if np.any(x[0])]
+    moved = max(float(np.abs(b - a).max() / np.abs(a).max()) for a, b in estimates)
+    added = covariance[1] - covariance[0]
+    expected = 0.01 * N[0] @ N[0].swapaxes(-1, -2)
+    return moved, float(np.abs(added - expected).max() / np.abs(expected).max())
+
+
+GAUGE = {PLANAR: 3, SPATIAL: 6}
+REMEDIES = [
+    ("scale_gauge+oc", PLANAR, "inverse_scaling"),
+    ("invariant", PLANAR, "anchored_homogeneous"),
+    ("robocentric+oc2", PLANAR, "inverse_scaling"),
+    ("robocentric+oc", SPATIAL, "image_plane"),
+    ("world+oc", PLANAR, "framed_homogeneous"),
+    ("world+fej", PLANAR, "inverse_scaling"),
+    ("world+fej2", PLANAR, "inverse_scaling"),
+    ("world+decoupled", PLANAR, "inverse_scaling"),
+]
+
+
+@pytest.mark.parametrize(("name", "geometry", "landmark"), quick_rows(2, REMEDIES))
+def test_uncertainty_of_the_gauge_changes_no_estimate_ever(name, geometry, landmark):
+    """Through whole steps: K and the mean are the same, and P keeps what was added, N Σ Nᵀ."""
+    count = GAUGE[geometry] + (name != "invariant")  # which knows nothing of the scale
+    slam = case(geometry).filter(name, landmark)
+    moved, forgotten = difference_of_runs(slam, case(geometry), count)
+    assert moved < 1e-9
+    assert forgotten < 1e-7
+
+
+@pytest.mark.slow
+def test_a_plain_filter_learns_what_it_cannot_see():
+    slam = case(PLANAR).filter("robocentric")
+    moved, forgotten = difference_of_runs(slam, case(PLANAR), GAUGE[PLANAR] + 1)
+    assert moved > 1e-5
+    assert forgotten > 1e-2
+
+
+@pytest.mark.slow
+def test_where_the_heading_is_known_all_are_the_kalman_filter():
+    """Relative positions at a known heading are linear: one filter in every coordinates."""
+    case = Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
+    frames = case.controls(), *case.frames(0)
+    linear = case.compiled("world", "cartesian")(*frames)[1]
+    assert np.trace(linear[1][-1]) > 1e-3
+    for name in ("world+oc", "world+fej", "world+decoupled", "invariant"):
+        same = case.compiled(name, "cartesian")(*frames)[1]
+        for x, y in zip(jax.tree.leaves(linear), jax.tree.leaves(same), strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
+
+
+# --- the gauge ------------------------------------------------------------------------------------
+
+
+MATCHED = jaxslam.scenario("matched-loose", landmarks=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "log_scale"),
+    [("scale_gauge", 0.3), ("world_gauge", 0.0), ("scale_gauge+submaps", 0.3)],
+)
+def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scale):
+    """`Φ N_k = N_{k+1}`, whatever the filter's unit of length is (noise is not enlarged here)."""
+    made: Any = make_filter(name, **scenario_pieces(MATCHED))
+    slam = made.one
+    pixels = jnp.array([[100.0], [300.0], [500.0]])
+    first = jaxslam.Features(jnp.arange(3), pixels, jnp.ones(3, bool))
+    control = jnp.asarray(1 / 30)
+
+    def off(log_scale):
+        state, group = slam.init(3, first), slam.motion.geometry.group
+        moved = exp(group, jnp.array([0.5, 0.7, 0.3]))
+        core = replace(
+            state.core,
+            log_scale=log_scale[None],
+            motion=state.core.motion + jnp.array([0.1, 0.3, 0.2]),
+            pose=slam.frame.compose(state.core.pose, moved),
+        )
+        state = replace(state, core=core)
+        change = composition(slam.model, state, Context(control))
+
+        def after(both):
+            core, landmarks = both
+            if change.landmark is not None:
+                one = jax.vmap(change.landmark, in_axes=(None, 0))
+                landmarks = one(change.view(core), landmarks)
+            return change.core(core), landmarks
+
+        Phi = jacobian(after, (state.core, state.landmarks))
+        core, landmarks = after((state.core, state.landmarks))
+        later = replace(state, core=core, landmarks=landmarks)
+        N, N_later = (unobservable_directions(slam.model, x) for x in (state, later))
+        keep = np.setdiff1d(np.arange(len(N)), np.r_[core.part("noise")])
+        return (Phi @ N - N_later)[keep]
+
+    np.testing.assert_allclose(quick_jit(off)(jnp.asarray(log_scale)), 0, atol=1e-12)
+
+
+# --- first estimates ------------------------------------------------------------------------------
+
+
+SPACE = {
+    "geometry": "spatial",
+    "velocity": (0.0, 0.0, 0.25, 0.0, -0.075, 0.0),
+    "odometry_sigma": (0.01, 0.01, 0.01, 0.05, 0.05, 0.05),
+}
+
+
+@cache
+def positions(geometry):
+    space = SPACE if geometry is SPATIAL else {}
+    return Case("positions", steps=3, landmarks=6, range=(0.0, 50.0), **space)
+
+
+def second_update(name, geometry):
+    """The model, a predicted state whose landmarks are not their first estimates, what is seen
+    then, and the state after the update."""
+    start = positions(geometry)
+    slam = start.filter(name, "cartesian")
+    first, known, new = start.frames(0)
+    controls = start.controls()
+
+    def run():
+        state = slam.init(6, first)
+        for i in range(2):
+            now, fresh = (jax.tree.map(lambda x, i=i: x[i], part) for part in (known, new))
+            state, _ = slam.step(state, controls[i], now, fresh)
+        before = slam.predict(state, controls[2])
+        seen = jax.tree.map(lambda x: x[2], known)
+        return before, seen, *slam.update(before, controls[2], seen)
+
+    return slam, *quick_jit(run)()
+
+
+def test_fej2_is_the_update_by_the_left_null_space():
+    """Of H − H₁, by an SVD: mean and covariance but for the transport are those of what is left."""
+    slam, before, seen, after, _ = second_update("world+fej2", PLANAR)
+    first = replace(before, landmarks=before.first)
+    parts = [observe(slam.model, x, seen.slots, COMPOSED) for x in (before, first)]
+    H, H_first = (placed(part[2], seen.slots, len(before.active)) for part in parts)
+    used = np.repeat(seen.valid & before.active[seen.slots], 2)
+    assert used.sum() >= 6
+    H, H_first = np.asarray(H)[used], np.asarray(H_first)[used]
+    residual = np.asarray(seen.measured - parts[0][0]).ravel()[used]
+    U, sizes, _ = np.linalg.svd(H - H_first)
+    rank = int(np.sum(sizes > 1e-9 * sizes[0]))
+    assert rank == 1  # of the heading
+    left = U[:, rank:].T
+    A, P = left @ H_first, np.asarray(before.covariance)
+    R = left @ left.T * float(noises(slam.sensor, seen.measured)[0, 0])
+    K = P @ A.T @ np.linalg.inv(A @ P @ A.T + R)
+    close(minus(after, before), K @ left @ residual, 1e-5)
+    landmarks = slice(before.core_dim, None)
+    close(after.covariance[landmarks, landmarks], (P - K @ A @ P)[landmarks, landmarks], 1e-5)
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=lambda x: x.name)
+def test_a_decoupled_correction_moves_the_pose_by_its_group(geometry):
+    """`Exp(ξ) pose`, ξ of the additive correction of the same gain; landmarks are as in FEJ."""
+    slam, before, _, after, _ = second_update("world+decoupled", geometry)
+    plain = replace(
+        slam, correction=positions(geometry).filter("world+fej", "cartesian").correction
+    )
+    _, _, seen, *_ = second_update("world+fej", geometry)
+    added, _ = quick_jit(lambda: plain.update(before, positions(geometry).controls()[2], seen))()
+    start = replace(before, landmarks=before.first)
+    _, L = rigid_directions(slam.model, start)
+    moved = exp(geometry.group, L @ minus(added, before))
+    expected = moved @ before.core.pose.joined()
+    close(after.core.pose.joined().as_matrix(), expected.as_matrix(), 1e-12)
+    close(after.landmarks, added.landmarks, 1e-12)
+    difference = after.core.pose.translation - added.core.pose.translation
+    assert np.abs(difference).max() > 1e-9
+
+
+def test_oc_in_the_world_is_the_affine_filter():
+    """Song et al., arXiv:2412.10809: with a rotation's error in B, `P ← A P Aᵀ`, A the identity but
+    for `S(p) − S(p⁺)` of the position and of every landmark."""
+    slam, before, seen, after, _ = second_update("world+oc", SPATIAL)
+    control = positions(SPATIAL).controls()[2]
+    plain = replace(slam, correction=positions(SPATIAL).filter("world", "cartesian").correction)
+    added, _ = quick_jit(lambda: plain.update(before, control, seen))()
+
+    def in_base(state):
+        """The Jacobian to coordinates whose rotation error is in B: `R Exp(θ) = Exp(R θ) R`."""
+        rotation = state.core.pose.rotation.as_matrix()
+        return jnp.eye(len(state.covariance)).at[3:6, 3:6].set(rotation)
+
+    def cross(x):
+        return jacobian(lambda y: jnp.cross(x, y), jnp.zeros(3))
+
+    A = jnp.eye(len(before.covariance))
+    c = before.core_dim
+    places = [(0, before.core.pose.translation, added.core.pose.translation)]
+    points = zip(before.landmarks, added.landmarks, strict=True)
+    places += [(c + 3 * i, *pair) for i, pair in enumerate(points) if before.active[i]]
+    for row, old, new in places:
+        A = A.at[row : row + 3, 3:6].set(cross(old - new))
+    # The update's covariance, as the published filter has it, at the pose before and after.
+    before_to_base, after_to_base = in_base(before), in_base(added)
+    expected = A @ before_to_base @ added.covariance @ before_to_base.T @ A.T
+    found = after_to_base @ after.covariance @ after_to_base.T
+    close(found, expected, 1e-10)
+
+
+# --- the right-invariant filter -------------------------------------------------------------------
+
+
+def predicted(slam, geometry):
+    """A predicted state whose pose and landmarks are uncertain together, and its measurements."""
+    start = case(geometry)
+    first, known, _ = start.frames(0)
+    state = slam.predict(slam.init(5, first), start.controls()[0])
+    # A heading uncertain enough for a large correction.
+    t = geometry.tangent_dim
+    moved = state.covariance.at[jnp.arange(t), jnp.arange(t)].add(1e-2)
+    features = jax.tree.map(lambda x: x[0], known)
+    features = replace(features, measured=features.measured + 60.0)  # of 650 a radian
+    return replace(state, covariance=moved), features
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=named)
+def test_cartesian_landmarks_are_corrected_as_published(geometry):
+    """`p ← R p + V ξ`, V by `Exp(ξ, θ) = (R, V ξ)`, but for θ²/24 of a landmark's own ξ."""
+    slam = case(geometry).filter("invariant", Cartesian().name)
+    n = geometry.point_dim
+
+    def corrected():
+        state, features = predicted(slam, geometry)
+        added, _ = Kalman().update(slam.model, state, features, slam.sensor.noise, COMPOSED)
+        after, _ = slam.update(state, None, features)
+        return state, added, after
+
+    before, added, after = quick_jit(corrected)()
+    T, T_added = before.core.pose.joined(), added.core.pose.joined()
+    turn = T.rotation().inverse() @ T_added.rotation()
+    theta = log(turn) if n == 2 else T.rotation() @ log(turn)
+
+    def cross(x):
+        return theta[0] * jnp.array([-x[1], x[0]]) if n == 2 else jnp.cross(theta, x)
+
+    size = float(jnp.linalg.norm(theta))
+    assert size > 0.02
+
+    def xi(x, x_added):
+        return x_added - x - cross(x)
+
+    def published(x, x_added):
+        return exp(geometry.group, jnp.append(xi(x, x_added), theta)) @ x
+
+    expected = jax.vmap(published)(before.landmarks, added.landmarks)
+    own = jax.vmap(xi)(before.landmarks, added.landmarks)
+    own -= xi(T.translation(), T_added.translation())
+    # V(θ) and R(θ/2) differ by θ²/24.
+    bound = size**2 / 20 * np.linalg.norm(own, axis=1)
+    assert np.all(np.linalg.norm(after.landmarks - expected, axis=1) < bound)
+    close(after.core.pose.translation, published(T.translation(), T_added.translation()), 1e-12)
+    # Not what addition gives.
+    assert np.all(np.linalg.norm(added.landmarks - expected, axis=1) > 2 * bound)
+
+
+# --- landmarks that drift -------------------------------------------------------------------------
+
+
+def test_a_feature_of_a_landmark_that_drifts_is_expected_by_so_much_less_surely():
+    """`H (P + H⁺ share² R H⁺ᵀ) Hᵀ + R` is `S + share² R`."""
+    of = case(SPATIAL)
+    first, known, _ = of.frames(0)
+    seen = jax.tree.map(lambda x: x[0], known)
+
+    def compared(name):
+        slam = of.filter(name)
+
+        def run(first, seen):
+            state = slam.predict(slam.init(of.capacity, first), of.controls()[0])
+            return slam.update(state, of.controls()[0], seen)[1]
+
+        return quick_jit(run)(first, seen), slam.sensor.noise
+
+    (fixed, R), (drifting, _) = compared("robocentric"), compared("robocentric+drift30")
+    m, p = fixed.used.size, len(R)
+    more = np.asarray(drifting.covariance - fixed.covariance).reshape(m, p, m, p)
+    assert fixed.used.all()
+    expected = np.einsum("ij,kl->ikjl", np.eye(m), 0.3**2 * R)
+    np.testing.assert_allclose(more, expected, atol=1e-9)
+    assert drifting.nis < fixed.nis
