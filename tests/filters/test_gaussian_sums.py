@@ -195,6 +195,29 @@ def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost():
     assert np.linalg.eigvalsh(after.members.covariance).min() > -1e-12
 
 
+def test_of_a_sum_landmarks_and_the_error_of_the_pose_have_its_moments():
+    state, slam, slots = some_sum(), case().filter("scale_gauge+mixture9"), jnp.arange(4)
+    truth = jax.tree.map(lambda x: x[-1], case().run(0).poses)
+
+    @quick_jit
+    def told(state):
+        def both(slam, state):
+            return (
+                slam.landmark_marginal(state, lambda view: view.point, slots),
+                slam.pose_error(state, truth),
+            )
+
+        return both(slam, state), jax.vmap(lambda member: both(slam.inner, member))(state.members)
+
+    weights = np.exp(state.log_weights)
+    for (mean, covariance), (means, covariances) in zip(*told(state), strict=True):
+        expected = np.tensordot(weights, means, 1)
+        away = np.asarray(means) - expected
+        spread = covariances + away[..., :, None] * away[..., None, :]
+        np.testing.assert_allclose(mean, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(covariance, np.tensordot(weights, spread, 1), atol=1e-12)
+
+
 def test_of_many_members_each_has_to_gain_more(monkeypatch):
     state = some_sum()
 
