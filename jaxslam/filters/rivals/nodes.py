@@ -82,7 +82,7 @@ Similarity = tuple[Pose, Float[Array, " 1"]]
 """(T, λ): X is at `T (e^λ X)`."""
 
 
-class Node(eqx.Module):
+class MapNode(eqx.Module):
     """A map in the camera N in which it began, and the last camera C."""
 
     landmarks: Float[Array, "slots d"]
@@ -92,18 +92,18 @@ class Node(eqx.Module):
     camera: Pose
     """T_NC."""
     covariance: Float[Array, "s s"]
-    """Of camera and landmarks."""
+    """The covariance of the camera and of all landmarks."""
 
 
-class Graph(eqx.Module):
+class NodeGraph(eqx.Module):
     """The active node, and the way to it."""
 
-    node: Node
+    node: MapNode
     velocity: Float[Array, " t"]
     """In the camera's axes and the node's unit."""
     velocity_root: Float[Array, "t t"]
     """R of its covariance `R Rᵀ`."""
-    earlier: Node
+    earlier: MapNode
     """The node before, as it was left."""
     edge: Similarity
     """The active node in the earlier one."""
@@ -113,18 +113,12 @@ class Graph(eqx.Module):
     chain_covariance: Float[Array, "u u"]
 
 
-class Coalesced(Innovation):
-    """How a frame and the map disagree once the camera is found, which takes numbers of its own."""
-
-    camera_dim: int = eqx.field(static=True, default=0)
-
-    @property
-    def nis_dof(self) -> Int[Array, ""]:
-        return jnp.maximum(self.residual.shape[-1] * jnp.sum(self.used) - self.camera_dim, 0)
-
-
 class Nodes(AbstractFilter):
-    """A map of nodes. Raises ValueError for pieces of which there is none."""
+    """A map of nodes. Raises ValueError for pieces of which there is none.
+
+    The camera of a frame is found from the same numbers: NIS has as many degrees of freedom fewer
+    than are counted as a camera has.
+    """
 
     slam: AbstractSlam
     """The motion, the sensor, its calibration and the prior on 1/z."""
@@ -153,7 +147,7 @@ class Nodes(AbstractFilter):
 
     def init(
         self, capacity: int | Capacity, first: Features | None = None, known: PriorMap | None = None
-    ) -> Graph:
+    ) -> NodeGraph:
         """Raises ValueError for a prior map, which has no frames that could be coalesced."""
         if known is not None:
             raise ValueError("a map of nodes takes no prior map; leave out known")
@@ -163,15 +157,15 @@ class Nodes(AbstractFilter):
         d, t = slam.motion.geometry.point_dim, len(root)
         landmarks = jnp.zeros((count, d), root.dtype).at[:, -1].set(slam.depth.mean)
         P, sure = (jnp.zeros((x, x), root.dtype) for x in (t + count * d, t + 1))
-        node = Node(landmarks, P[t:, t:], jnp.zeros(count, bool), here, P)
+        node = MapNode(landmarks, P[t:, t:], jnp.zeros(count, bool), here, P)
         same = here, sure[0, :1]
-        state = Graph(node, velocity, root, node, same, sure, same, sure)
+        state = NodeGraph(node, velocity, root, node, same, sure, same, sure)
         if first is None:
             return state
         check_features(slam, first)
         return replace(state, node=self._coalesced(state, first, jnp.array(True), root)[0])
 
-    def step(self, state: Graph, control: Control, seen: Features, new: Features) -> Corrected:
+    def step(self, state: NodeGraph, control: Control, seen: Features, new: Features) -> Corrected:
         """Measurements have noise factors in both, or in none."""
         slam, velocity = cast(self.slam, state.velocity.dtype), state.velocity
         check_control(slam.motion, control)
@@ -193,7 +187,7 @@ class Nodes(AbstractFilter):
         shared = jnp.any(node.held & state.earlier.held)
         return jax.lax.cond(shared, lambda x: self._joined(x), lambda x: x, state), innovation
 
-    def remove(self, state: Graph, gone: Bool[AnyArray, " slots"]) -> Graph:
+    def remove(self, state: NodeGraph, gone: Bool[AnyArray, " slots"]) -> NodeGraph:
         """Marginalise landmarks and free their slots. An edge that was found from them stays."""
         node, earlier, t = state.node, state.earlier, state.velocity.size
         rows = jnp.append(jnp.ones(t, bool), jnp.repeat(~gone & node.held, node.landmarks.shape[1]))
@@ -204,21 +198,23 @@ class Nodes(AbstractFilter):
         node = replace(node, information=kept, held=node.held & ~gone, covariance=P)
         return replace(state, node=node, earlier=replace(earlier, held=stays))
 
-    def in_map(self, state: Graph) -> Bool[Array, " slots"]:
+    def in_map(self, state: NodeGraph) -> Bool[Array, " slots"]:
         """Those of the active node."""
         return state.node.held
 
-    def marginal(self, state: Graph, function: OfCamera) -> Moments:
+    def marginal(self, state: NodeGraph, function: OfCamera) -> Moments:
         return _moments(lambda pose, *_: function(CameraView(pose)), state, 0)
 
-    def landmark_marginal(self, state: Graph, function: OfLandmark, slots: Slots) -> EachMoments:
+    def landmark_marginal(
+        self, state: NodeGraph, function: OfLandmark, slots: Slots
+    ) -> EachMoments:
         def value(pose, log_scale, camera, landmark):
             point, omega = _seen(camera, landmark)
             return function(LandmarkView(pose, point, omega * jnp.exp(-log_scale[0])))
 
         return jax.vmap(partial(_moments, value, state))(slots)
 
-    def _due(self, node: Node, features: Features) -> Bool[Array, ""]:
+    def _due(self, node: MapNode, features: Features) -> Bool[Array, ""]:
         """Whether the predicted camera has left the node, and sees enough of it for an edge."""
         again, (_, d) = jnp.sum(_again(node, features)), node.landmarks.shape
         points, omegas = jax.vmap(_PLANE.homogeneous)(node.landmarks)
@@ -227,7 +223,7 @@ class Nodes(AbstractFilter):
         few = again < self.share * jnp.sum(node.held)
         return (left | few) & (d * again > self.slam.motion.geometry.tangent_dim)
 
-    def _begun(self, state: Graph, features: Features) -> Graph:
+    def _begun(self, state: NodeGraph, features: Features) -> NodeGraph:
         """A node at the predicted camera, with nothing in it but its unit."""
         old, way = state.node, (state.chain, state.edge)
         moved = jax.vmap(partial(_PLANE.transform, old.camera.inverse()))(old.landmarks)
@@ -236,7 +232,7 @@ class Nodes(AbstractFilter):
         weight = weight / jnp.maximum(weight @ weight, 1e-9) / _UNIT
         unit = jnp.zeros_like(landmarks).at[:, -1].set(weight).ravel()
         here = identity(self.slam.motion.geometry, weight.dtype)
-        node = Node(landmarks, unit[:, None] * unit, old.held & False, here, old.covariance * 0)
+        node = MapNode(landmarks, unit[:, None] * unit, old.held & False, here, old.covariance * 0)
         (T, log_scale), J = _composed(*way), jacobian(lambda way: _composed(*way), way)
         return replace(
             state,
@@ -248,9 +244,9 @@ class Nodes(AbstractFilter):
             chain_covariance=J @ block_diag(state.chain_covariance, state.edge_covariance) @ J.T,
         )
 
-    def _coalesced(self, state: Graph, features: Features, pinned, told, again: int = 0):
+    def _coalesced(self, state: NodeGraph, features: Features, pinned, told, again: int = 0):
         """The node with the frame's measurements in it, the first `again` of which may be of
-        landmarks in the map, and their `Coalesced`. `pinned`: the camera is the node's own; else
+        landmarks in the map, and their innovation. `pinned`: the camera is the node's own; else
         `told` is the covariance of its pose by the motion."""
         node, slots, slam = state.node, features.slots, cast(self.slam, state.velocity.dtype)
         sensor, t, p, (count, d) = slam.sensor, len(told), slam.sensor.size, node.landmarks.shape
@@ -326,10 +322,10 @@ class Nodes(AbstractFilter):
         before = (used & ~begins)[:again]
         r = jnp.where(before[:, None], r[:again, :p], 0.0)
         told = before, jnp.where(jnp.any(before), cost, 0.0), judged(factor.positive, landmarks, P)
-        innovation = Coalesced(measured[:again] - r, r, None, *told, camera_dim=t)
-        return Node(landmarks, information, held, camera, P), innovation
+        innovation = Innovation(measured[:again] - r, r, None, *told)
+        return MapNode(landmarks, information, held, camera, P), innovation
 
-    def _joined(self, state: Graph) -> Graph:
+    def _joined(self, state: NodeGraph) -> NodeGraph:
         """The edge between the active node and the earlier one, from the landmarks they share."""
         node, earlier, t = state.node, state.earlier, state.velocity.size
         rows, u = jnp.repeat(node.held & earlier.held, node.landmarks.shape[1]), t + 1
@@ -369,7 +365,7 @@ def with_nodes(slam: AbstractFilter, parallax: int = 50) -> Nodes:
     raise ValueError("nodes take the place of all pieces but these: robocentric+nodes is accepted")
 
 
-def _again(node: Node, features: Features) -> Bool[Array, " slots"]:
+def _again(node: MapNode, features: Features) -> Bool[Array, " slots"]:
     """The node's landmarks that are seen."""
     places = features.places(node.held.size)
     return jnp.zeros_like(node.held).at[places].set(True, mode="drop") & node.held
@@ -385,7 +381,9 @@ def _composed(first: Similarity, second: Similarity) -> Similarity:
     return T @ scaled(V, jnp.exp(a[0])), a + b
 
 
-def _moments(function: Callable[..., PyTree], state: Graph, slot: Int[Array, ""] | int) -> Moments:
+def _moments(
+    function: Callable[..., PyTree], state: NodeGraph, slot: Int[Array, ""] | int
+) -> Moments:
     """Of a function of T_BC, log of the node's unit in metres, T_NC, and the landmark in a slot."""
     node, t, d = state.node, state.velocity.size, state.node.landmarks.shape[1]
 
