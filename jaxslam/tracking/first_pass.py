@@ -29,8 +29,10 @@ be used again."""
 
 
 def finds_lens(source: Source, settings: TrackerSettings) -> bool:
-    """Whether the lens is a guess, which the tracker estimates."""
-    return source.calibration.guessed and settings.calibration in (None, "estimated")
+    """Whether the lens is a guess, which the tracker estimates, of a global shutter: a bundle knows
+    no other."""
+    estimated = settings.calibration in (None, "estimated") and not settings.readout
+    return source.calibration.guessed and estimated
 
 
 def with_lens_found(source: Source, settings: TrackerSettings, out: Path) -> Source:
@@ -38,6 +40,7 @@ def with_lens_found(source: Source, settings: TrackerSettings, out: Path) -> Sou
     it is where they tell less of the focal length than the guess did."""
     given, history = source.calibration, list[Tracked]()
     tracker = Tracker(given, settings)
+    out.mkdir(parents=True, exist_ok=True)
     with suppress(ValueError):  # which the tracking that follows meets again
         for frame in islice(source, FRAMES):
             history.append(tracker.track(frame))

@@ -66,7 +66,6 @@ def track(
     FILE.rrd, written beside the others.
     """
     out, begins = Path(out), time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:
         settings = settings or TrackerSettings()
@@ -79,6 +78,7 @@ def track(
         tracker = Tracker.localising(known, source.calibration, slam)
     if source.clock is not None:
         tracker.compile()
+    out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
     seconds: list[float] = []
     try:
@@ -158,15 +158,15 @@ def _write(
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
     caveat = caveat_of(tracker)
-    summary = summarised(source, tracker, history, points, seconds)
     write_covariances(
         out / "covariance.txt",
         times,
         covariances,
         given_scale=scaled,
-        length=summary["unit"],
+        length="map" if tracker.inertial is None else "m",
         caveat=caveat,
     )
+    summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:
         assert source.reference is not None
         with suppress(ValueError):

@@ -36,6 +36,7 @@ def test_it_is_of_guesses_that_are_estimated_alone():
     assert finds_lens(guessed, TrackerSettings())
     assert not finds_lens(source, TrackerSettings())
     assert not finds_lens(guessed, TrackerSettings(calibration="consider"))
+    assert not finds_lens(guessed, TrackerSettings(readout=0.02))
 
 
 def test_a_picture_that_cannot_be_read_is_no_matter_of_the_first_pass(tmp_path):
