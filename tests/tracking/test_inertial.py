@@ -130,7 +130,7 @@ def folder(short, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_command_tracks_with_the_readings_of_a_folder(folder, tmp_path, capsys):
+def test_the_command_tracks_with_the_readings_of_a_folder(short, folder, tmp_path, capsys):
     """The way of files and options into the filter, and of metres into the summary."""
     files = tuple(folder.parent / x for x in ("imu.yaml", "camchain-imucam.yaml"))
     TrackOptions(
@@ -139,7 +139,11 @@ def test_the_command_tracks_with_the_readings_of_a_folder(folder, tmp_path, caps
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["unit"] == "m"
     assert summary["filter"] == INERTIAL
-    assert summary["inertial"] == {"readings": str(folder / "imu.csv"), "start": "at rest"}
+    unit = summary["inertial"]
+    assert (unit["readings"], unit["start"]) == (str(folder / "imu.csv"), "at rest")
+    off = (np.asarray(unit["biases"]) - short.bias) / unit["biases_sigma"]
+    assert np.abs(off).max() < 4
+    assert "length=m" in (tmp_path / "covariance.txt").read_text().splitlines()[0]
     assert summary["ate_metres"]["alignment"] == "se3"
     assert summary["ate_metres"]["rmse"] < 0.02 * summary["ate_metres"]["path_length"]
     assert "positions are in metres, by" in capsys.readouterr().out
