@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from benchmark import RESULTS, Benchmark, number, table
-from rendered_videos import KINDS, rendered_source
+from rendered_videos import KINDS, READOUT, rendered_source
 from scipy.stats import chi2
 from sequences import tracked
 from stress import LIE
@@ -36,7 +36,7 @@ class Rendered(Benchmark):
     """The default tracker on rendered videos."""
 
     only: tuple[str, ...] = VIDEOS
-    """Kinds of videos, with +blur or +exposure."""
+    """Kinds of videos, each with any of `rendered_videos.MODIFIERS` after a +."""
     seeds: tuple[int, ...] = (0,)
     """One video each."""
     videos: Path | None = None
@@ -48,7 +48,9 @@ class Rendered(Benchmark):
         results: Results = self.found()
         for seed in self.seeds:
             for name in self.only:
-                done = measure(rendered_source(name, seed, folder=self.videos))
+                told = "rolling" in name and "untold" not in name
+                settings = TrackerSettings(readout=READOUT if told else 0.0)
+                done = measure(rendered_source(name, seed, folder=self.videos), settings)
                 results.setdefault(name, {})[str(seed)] = done
                 print(name, seed, done, flush=True)
                 yield results
@@ -57,9 +59,9 @@ class Rendered(Benchmark):
         yield "sequences.md", MARK, as_table(results)
 
 
-def measure(source) -> dict[str, Any]:
+def measure(source, settings: TrackerSettings) -> dict[str, Any]:
     """The numbers of one video."""
-    summary, found = tracked(source, TrackerSettings())
+    summary, found = tracked(source, settings)
     numbers = {
         key: summary[key]
         for key in ("frames", "tracked", "maps", "loops", "loops_refused", "matches_per_frame")

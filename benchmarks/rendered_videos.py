@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jaxslam._runtime.files import write_atomically
-from jaxslam.io.calibration import Calibration
+from jaxslam.io.calibration import Calibration, from_field_of_view
 from jaxslam.io.source import Image, Source, Trajectory
 from jaxslam.tracking.optics import rays
 from jaxslam.tracking.synthetic import add_noise
@@ -262,8 +262,13 @@ LENSES = {
     ),
 }
 """Of other lenses: phones', and a fisheye that sees 180° across and 250° from corner to corner."""
-MODIFIERS = ("blur", "exposure", *LENSES)
-"""What may follow the kind of a video, each after a +."""
+MODIFIERS = ("blur", "exposure", "rolling", *LENSES, "guess", "untold")
+"""What may follow the kind of a video, each after a +: of a `guess` the lens is not given, and
+of an `untold` one the readout of a rolling shutter."""
+READOUT = 0.02
+"""Seconds from the first row to the last of a rolling shutter."""
+_BAND = 6
+"""Rows that are seen from one pose then."""
 SHUTTER = 0.5
 """The share of the time between frames over which a blurred one is exposed."""
 _FLOOR = 1.4
@@ -312,8 +317,13 @@ def rendered_source(
                         cv2.imwrite(str(temporary), image)
             yield image
 
-    truth = Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1])))
-    return Source(f"{name} (seed {seed})", _lens(modifiers), times, images, truth)
+    truth, lens = (
+        Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1]))),
+        _lens(modifiers),
+    )
+    if "guess" in modifiers:
+        lens = from_field_of_view(lens.width, lens.height)
+    return Source(f"{name} (seed {seed})", lens, times, images, truth)
 
 
 def _lens(modifiers: list[str]) -> Calibration:
@@ -327,8 +337,19 @@ def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, in
     offsets = np.zeros(1)
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
-    poses = kind.poses(time + offsets, np.random.default_rng([seed, 1]))
-    grey = np.mean([render(bodies, T_wc, _lens(modifiers), sky) for T_wc in poses], axis=0)
+
+    def exposed(lens: Calibration, late: float) -> Float[np.ndarray, "h w"]:
+        poses = kind.poses(time + late + offsets, np.random.default_rng([seed, 1]))
+        return np.mean([render(bodies, T_wc, lens, sky) for T_wc in poses], axis=0)
+
+    lens = _lens(modifiers)
+    if "rolling" in modifiers:
+        tops = np.arange(0, lens.height, _BAND)
+        lates = READOUT * ((tops + (_BAND - 1) / 2 - lens.cy) / lens.height)
+        bands = [replace(lens, height=_BAND, cy=lens.cy - top) for top in tops.tolist()]
+        grey = np.vstack([exposed(*one) for one in zip(bands, lates.tolist(), strict=True)])
+    else:
+        grey = exposed(lens, 0.0)
     if "exposure" in modifiers:
         grey = (0.8 + 0.25 * np.cos(2 * np.pi * time / 5.3)) * grey + 12 * np.sin(time)
     return add_noise(as_image(grey), np.random.default_rng([seed, 2, index]))
