@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import close, each_geometry, named, quick_jit
+from cases import close, each_geometry, named, quick_jit, quick_rows
 
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.filters.rivals.nodes import Nodes
@@ -132,7 +132,7 @@ def batch(slam, geometry):
     return np.asarray(J.T @ J), landmarks
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+@pytest.mark.parametrize("geometry", quick_rows(1, each_geometry), ids=named)
 def test_the_information_of_a_node_is_that_of_all_its_frames_without_their_cameras(geometry):
     """Of the last camera too, which leaves the map with the next frame."""
     slam, cameras, t = the_filter(geometry), 4 * geometry.tangent_dim, geometry.tangent_dim
@@ -166,7 +166,7 @@ def long_run(geometry):
     return slam, quick_jit(partial(run, slam))(*frames_of(slam, geometry, 40, DEPTHS))
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+@pytest.mark.parametrize("geometry", quick_rows(1, each_geometry), ids=named)
 def test_a_chain_of_nodes_follows_a_run_without_noise(geometry):
     _, (states, _, (poses, covariances)) = long_run(geometry)
     earlier = np.any(np.asarray(states.earlier.held), axis=1).tolist()

@@ -245,7 +245,7 @@ def test_fej2_is_the_update_by_the_left_null_space():
     close(after.covariance[landmarks, landmarks], (P - K @ A @ P)[landmarks, landmarks], 1e-5)
 
 
-@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=lambda x: x.name)
+@pytest.mark.parametrize("geometry", quick_rows(1, [PLANAR, SPATIAL]), ids=named)
 def test_a_decoupled_correction_moves_the_pose_by_its_group(geometry):
     """`Exp(ξ) pose`, ξ of the additive correction of the same gain; landmarks are as in FEJ."""
     slam, before, _, after, _ = second_update("world+decoupled", geometry)
