@@ -106,6 +106,12 @@ def joined(rotation: Rotation, translation: Float[Array, " n"]) -> Pose:
     return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
 
 
+def step_tangents(batch: PyTree) -> Float[Array, "k t"]:
+    """`T_{k+1} ⊟ T_k` of every pose, or rotation, of a batch and the next one."""
+    before, after = jax.tree.map(lambda x: x[:-1], batch), jax.tree.map(lambda x: x[1:], batch)
+    return jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(before, after))
+
+
 def scaled(tree: Tree, scale: Scalar) -> Tree:
     """A pytree of poses, the lengths in them times `scale`."""
 

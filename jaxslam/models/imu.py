@@ -25,7 +25,17 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
-from jaxslam.geometry import SPATIAL, Geometry, Pose, Scalar, exp, joined, log, retract
+from jaxslam.geometry import (
+    SPATIAL,
+    Geometry,
+    Pose,
+    Scalar,
+    exp,
+    joined,
+    log,
+    retract,
+    step_tangents,
+)
 from jaxslam.models.motion import AbstractMotion
 
 Vector = Float[Array, " 3"]
@@ -279,8 +289,8 @@ class Imu(AbstractMotion):
         unit = jax.vmap(lambda T_WC: T_WC @ self.mount(off))(path)
         R, p = unit.rotation(), unit.translation()
         v = jnp.asarray(jnp.gradient(p, axis=0)) / seconds
-        turns = jax.vmap(log)(jax.vmap(lambda a, b: a.inverse() @ b)(*_neighbours(R)))
-        half = jax.vmap(lambda a, turn: a @ exp(jaxlie.SO3, turn / 2))(_neighbours(R)[0], turns)
+        turns, before = step_tangents(R), jax.tree.map(lambda x: x[:-1], R)
+        half = jax.vmap(lambda a, turn: a @ exp(jaxlie.SO3, turn / 2))(before, turns)
         if down is None:
             down = jax.tree.map(lambda x: x[0], R) @ jnp.asarray(self.down)
         pull = self.gravity * down
@@ -353,7 +363,3 @@ class Imu(AbstractMotion):
 
         _, poses = jax.lax.scan(move, (first, start), controls)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, poses)
-
-
-def _neighbours(batch):
-    return jax.tree.map(lambda x: x[:-1], batch), jax.tree.map(lambda x: x[1:], batch)

@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.geometry import Pose, exp, identity, log, retract
+from jaxslam.geometry import Pose, exp, identity, retract, step_tangents
 from jaxslam.linalg import semidefinite_root
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import PriorMap
@@ -220,9 +220,8 @@ def _path(world: World, key: Array) -> tuple[Pose, Control, None]:
 
 def _velocities(world: World, poses: Pose) -> Float[Array, "frames t"]:
     """The mean velocity of the step before every frame; in frame 0 that of the step after it."""
-    before, after = jax.tree.map(lambda x: x[:-1], poses), jax.tree.map(lambda x: x[1:], poses)
-    steps = jax.vmap(lambda a, b: log(a.inverse() @ b))(before, after) * world.rate
-    return jnp.concatenate([steps[:1], steps])
+    velocities = step_tangents(poses) * world.rate
+    return jnp.concatenate([velocities[:1], velocities])
 
 
 def _with_start(start: Pose, poses: Pose, still: int = 0) -> Pose:
