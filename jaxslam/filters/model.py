@@ -132,10 +132,14 @@ class SlamModel(eqx.Module):
 
     def displacement(self, core: Core, context: Context) -> Pose:
         """The camera's motion in this step; the identity once it is composed."""
+        return self._step(core, context)[0]
+
+    def _step(self, core: Core, context: Context) -> tuple[Pose, Variables]:
+        """The displacement, and the motion's variables after it; once composed, as they are."""
         if context.control is None:
-            return identity(self.geometry, core.noise.dtype)
+            return identity(self.geometry, core.noise.dtype), core.motion
         noise = self._noises(core, context)[0]
-        return self.moved(core.motion, noise, context.control, core.log_scale)[0]
+        return self.moved(core.motion, noise, context.control, core.log_scale)
 
     def _noises(
         self, core: Core, context: Context
@@ -150,15 +154,9 @@ class SlamModel(eqx.Module):
 
     def view(self, core: Core, context: Context) -> CameraInMap:
         """All that a landmark depends on."""
-        step = self.displacement(core, context)
+        step, variables = self._step(core, context)
         T_AC = self.frame.map_from_camera(core.pose, step)
-        delta = core.calibration
-        if self.sensor.rolling and core.motion is not None:
-            variables = core.motion
-            if context.control is not None:
-                noise = self._noises(core, context)[0]
-                variables = self.moved(variables, noise, context.control, core.log_scale)[1]
-            delta = self.in_motion(delta, variables)
+        delta = self.in_motion(core.calibration, variables)
         return CameraInMap(T_AC, delta, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
@@ -252,9 +250,14 @@ class SlamModel(eqx.Module):
         sensor = self.sensor_at(view.calibration)
         return sensor.measure(point, omega), sensor.possible(point)
 
-    def in_motion(self, delta: Float[Array, " k"], variables: Variables) -> Float[Array, " kt"]:
-        """δ, and behind it the motion's variables, where the sensor depends on its velocity."""
-        return jnp.concatenate([delta, variables]) if self.sensor.rolling else delta
+    def in_motion(
+        self, delta: Float[Array, " k"], variables: Variables | None
+    ) -> Float[Array, " kt"]:
+        """δ, and behind it the motion's variables, where the sensor depends on its velocity; None
+        of a core without any, of which no measurement is asked."""
+        if variables is None or not self.sensor.rolling:
+            return delta
+        return jnp.concatenate([delta, variables])
 
     def sensor_at(self, delta: Float[Array, " kt"], unit: Scalar | None = None) -> AbstractSensor:
         """The sensor whose calibration is off by δ, at the velocity behind that, of which the unit

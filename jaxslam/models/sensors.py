@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
-from jaxslam.geometry import GEOMETRIES, Homogeneous, Point, exp, homogeneous_apply
+from jaxslam.geometry import Homogeneous, Point, exp, homogeneous_apply
 from jaxslam.models.camera import Camera, project, ray
+from jaxslam.models.motion import geometry_of
 
 Measurement = Float[Array, " p"]
 
@@ -183,7 +184,7 @@ class Pinhole(AbstractSensor):
         """The point as the camera of so many seconds before has it."""
         if self.velocity is None:
             return point
-        (group,) = (g.group for g in GEOMETRIES.values() if g.point_dim == self.point_dim)
+        group = geometry_of(self.velocity, "the velocity of a camera").group
         return homogeneous_apply(exp(group, seconds * self.velocity), point, jnp.asarray(omega))
 
     @property
