@@ -317,10 +317,8 @@ def rendered_source(
                         cv2.imwrite(str(temporary), image)
             yield image
 
-    truth, lens = (
-        Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1]))),
-        _lens(modifiers),
-    )
+    truth = Trajectory(times, kind.poses(times, np.random.default_rng([seed, 1])))
+    lens = _lens(modifiers)
     if "guess" in modifiers:
         lens = from_field_of_view(lens.width, lens.height)
     return Source(f"{name} (seed {seed})", lens, times, images, truth)
@@ -337,19 +335,17 @@ def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, in
     offsets = np.zeros(1)
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
+    lens, rolling = _lens(modifiers), "rolling" in modifiers
+    readout, rows = (READOUT, _BAND) if rolling else (0.0, lens.height)
 
-    def exposed(lens: Calibration, late: float) -> Float[np.ndarray, "h w"]:
+    def band(top: int) -> Float[np.ndarray, "h w"]:
+        """Rows that are seen at once."""
+        late = readout * (top + (rows - 1) / 2 - lens.cy) / lens.height
         poses = kind.poses(time + late + offsets, np.random.default_rng([seed, 1]))
-        return np.mean([render(bodies, T_wc, lens, sky) for T_wc in poses], axis=0)
+        part = replace(lens, height=rows, cy=lens.cy - top)
+        return np.mean([render(bodies, T_wc, part, sky) for T_wc in poses], axis=0)
 
-    lens = _lens(modifiers)
-    if "rolling" in modifiers:
-        tops = np.arange(0, lens.height, _BAND)
-        lates = READOUT * ((tops + (_BAND - 1) / 2 - lens.cy) / lens.height)
-        bands = [replace(lens, height=_BAND, cy=lens.cy - top) for top in tops.tolist()]
-        grey = np.vstack([exposed(*one) for one in zip(bands, lates.tolist(), strict=True)])
-    else:
-        grey = exposed(lens, 0.0)
+    grey = np.vstack([band(top) for top in range(0, lens.height, rows)])[: lens.height]
     if "exposure" in modifiers:
         grey = (0.8 + 0.25 * np.cos(2 * np.pi * time / 5.3)) * grey + 12 * np.sin(time)
     return add_noise(as_image(grey), np.random.default_rng([seed, 2, index]))
