@@ -271,3 +271,6 @@ def test_nodes_take_no_prior_map_and_a_step_at_least():
         slam.init(1, known=known)
     with pytest.raises(ValueError, match="at least, not 0"):
         replace(slam, steps=0)
+    rolling = replace(slam.slam, sensor=replace(slam.slam.sensor, line=1e-4))
+    with pytest.raises(ValueError, match="nodes are of a global shutter"):
+        replace(slam, slam=rolling)

@@ -139,6 +139,7 @@ class Nodes(AbstractFilter):
                 calibration.sigma.size and not calibration.each_frame,
                 "with a calibration that is known, or drawn in every frame",
             ),
+            (slam.sensor.rolling, "of a global shutter: cameras of a frame are one"),
             (slam.depth.common is not None, "with priors on depth that have nothing in common"),
             (self.steps < 1, f"found in 1 step of Gauss–Newton at least, not {self.steps}"),
         ):
