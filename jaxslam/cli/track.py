@@ -215,9 +215,7 @@ class TrackOptions:
 
 def _seconds(time: str) -> float:
     """The seconds of a time with a unit. Raises ValueError."""
-    found = re.fullmatch(r"\s*([\d.]+)\s*(s|ms|us|µs|)\s*", time)
-    try:
-        number, unit = found.groups() if found else ("none", "")
-        return float(number) * {"s": 1.0, "": 1.0, "ms": 1e-3}.get(unit, 1e-6)
-    except ValueError:
-        raise ValueError(f"--readout is a time such as 20ms or 0.02s, not {time!r}") from None
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*(s|ms|us|µs|)\s*", time)
+    if found is None:
+        raise ValueError(f"--readout is a time such as 20ms or 0.02s, not {time!r}")
+    return float(found[1]) * {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}[found[2]]

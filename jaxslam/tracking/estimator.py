@@ -51,9 +51,6 @@ from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
 from jaxslam.tracking.pose_with_covariance import Pixels, Positions, Spreads, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
-LIVELY = 20.0
-"""The fall of NIS that makes a livelier prediction likelier: one of four times the σ in six
-directions has log det S larger by at most 12 log 4 = 17."""
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
 
 Report = tuple[jax.Array, ...]
@@ -187,11 +184,6 @@ class Estimator:
         """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
         S, residual = self._innovations(predicted, seen)
         return float(residual @ _solve(S, residual)), len(residual)
-
-    def likelier(self, lively: Predicted, predicted: Predicted, seen: Observations) -> bool:
-        """Return whether what is matched makes a livelier prediction likelier than another one."""
-        nis, livelier = (self.nis(one, seen.labelled("matched"))[0] for one in (predicted, lively))
-        return nis - livelier > LIVELY
 
     def each_given_others(self, predicted: Predicted, seen: Observations) -> Pixels:
         """Return the innovation of each that was seen given those of all others, whitened:

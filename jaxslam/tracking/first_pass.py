@@ -29,10 +29,10 @@ be used again."""
 
 
 def finds_lens(source: Source, settings: TrackerSettings) -> bool:
-    """Whether the lens is a guess, which the tracker estimates, of a global shutter: a bundle knows
-    no other."""
+    """Whether the lens is a guess, which the tracker estimates, of a recording, and of a global
+    shutter: a bundle knows no other."""
     estimated = settings.calibration in (None, "estimated") and not settings.readout
-    return source.calibration.guessed and estimated
+    return source.calibration.guessed and source.clock is None and estimated
 
 
 def with_lens_found(source: Source, settings: TrackerSettings, out: Path) -> Source:

@@ -45,6 +45,9 @@ MOST = 2 / 3
 believed."""
 JERK = 4.0
 """σ of the accelerations of a camera that is jerked, in that of others: motions have tails."""
+LIVELY = 20.0
+"""The fall of NIS that makes a livelier prediction likelier: one of four times the σ in six
+directions has log det S larger by at most 12 log 4 = 17."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]

@@ -68,7 +68,7 @@ def summarised(
         "lost_reasons": dict(Counter(result.reason for result in history if result.reason)),
         "restarts": tracker.restarts,
         "repeated": sum(result.repeated for result in history),
-        "unit": "map" if tracker.inertial is None else "m",
+        "unit": tracker.unit,
         "maps": max(1, len({result.map for result in history if not result.lost})),
         "relocalised": sum(result.relocalised for result in history),
         "submaps": len({result.submap for result in history}),

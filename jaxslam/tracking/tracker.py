@@ -23,7 +23,7 @@ from jaxslam.io.source import Frame, check_size
 from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
-from jaxslam.tracking.estimator import LIVELY, Correction, Estimator
+from jaxslam.tracking.estimator import Correction, Estimator
 from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState, in_view
@@ -33,7 +33,7 @@ from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.joining import LOOKED_EVERY, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
-from jaxslam.tracking.policy import JERK, LEAST_MATCHES, Policy
+from jaxslam.tracking.policy import JERK, LEAST_MATCHES, LIVELY, Policy
 from jaxslam.tracking.pose_with_covariance import Pixels, Places, Transform
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import INERTIAL, TrackerSettings
@@ -171,11 +171,12 @@ def _next(state: TrackerState, frame: Frame, policy: Policy, seconds: float) -> 
     seen, reason, doubtful = policy.observed(frame.image, state, predicted, lost=lost)
     # What an inertial unit feels is no jerk.
     if not lost and estimator.inertial is None and state.map.place.unit_fixed:
-        nis, _ = estimator.nis(predicted, seen.labelled("matched"))
+        matched = seen.labelled("matched")
+        nis, _ = estimator.nis(predicted, matched)
         # One that is less than the fall by which another prediction is likelier cannot fall so.
         if reason is not None or nis > LIVELY:
             jerked = estimator.predict(state.map.state, predicted.control, JERK)
-            if reason is not None or estimator.likelier(jerked, predicted, seen):
+            if reason is not None or nis - estimator.nis(jerked, matched)[0] > LIVELY:
                 found, why, wavers = policy.observed(frame.image, state, jerked, lost=lost)
                 if why is None:
                     predicted, seen, reason, doubtful = jerked, found, None, wavers
@@ -346,6 +347,11 @@ class Tracker:
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
             return joined(self.state.joins, *smoothed(self.state, history))
+
+    @property
+    def unit(self) -> str:
+        """The unit of length, `m` with an inertial unit, else `map`: each map has its own."""
+        return "map" if self.inertial is None else "m"
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy in pixels, and k1 and k2 of a

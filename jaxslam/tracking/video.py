@@ -71,7 +71,7 @@ def track(
         settings = settings or TrackerSettings()
         if inertial is not None:
             source, inertial = begun(source, inertial, settings)
-        elif slam is None and source.clock is None and finds_lens(source, settings):
+        elif slam is None and finds_lens(source, settings):
             source = with_lens_found(source, settings, out)
         tracker = Tracker(source.calibration, settings, slam, target, inertial)
     else:
@@ -163,7 +163,7 @@ def _write(
         times,
         covariances,
         given_scale=scaled,
-        length="map" if tracker.inertial is None else "m",
+        length=tracker.unit,
         caveat=caveat,
     )
     summary = summarised(source, tracker, history, points, seconds)

@@ -92,6 +92,10 @@ def test_consistency_writes_what_others_read_and_resumes(tmp_path, capsys):
         (["track", "--frames", "0"], "frames"),
         (["track", "--fov", "60"], "need a SOURCE"),
         (["track", "--calibration-treatment", "maybe"], "unknown calibration 'maybe'"),
+        *(
+            (["track", "--readout", time], f"such as 20ms or 0.02s, not '{time}'")
+            for time in ("20 m", "", "1..2ms", "20ms later")
+        ),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
         (["track", "--filter", "scale_gauge+lag5"], "modifier lag is no more: a fixed-lag window"),

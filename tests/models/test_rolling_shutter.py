@@ -8,6 +8,7 @@ import pytest
 from cases import a_filter, each_geometry, named, quick_jit
 
 import jaxslam
+from jaxslam.cli.track import TrackOptions
 from jaxslam.geometry import exp, homogeneous_apply
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.motion import Odometry
@@ -53,6 +54,11 @@ def test_a_filter_that_knows_the_readout_is_consistent_and_one_that_does_not_is_
     study = jaxslam.monte_carlo(rolling, filters, runs=40, seed=5)
     assert np.mean(study["knows"].nees.mean[-5:]) < 4.2
     assert np.mean(study["does not"].nees.mean[-5:]) > 30
+
+
+@pytest.mark.parametrize("time", ["20ms", " 0.02 s", ".02", "20000us", "20000 µs"])
+def test_a_readout_is_a_time_with_a_unit(time):
+    assert TrackOptions(readout=time)._settings().readout == pytest.approx(0.02)
 
 
 def test_it_needs_a_velocity():

@@ -35,6 +35,7 @@ def test_it_is_of_guesses_that_are_estimated_alone():
     guessed = replace(source, calibration=GUESS)
     assert finds_lens(guessed, TrackerSettings())
     assert not finds_lens(source, TrackerSettings())
+    assert not finds_lens(replace(guessed, clock=lambda: 0.0), TrackerSettings())
     assert not finds_lens(guessed, TrackerSettings(calibration="consider"))
     assert not finds_lens(guessed, TrackerSettings(readout=0.02))
 
