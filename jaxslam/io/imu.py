@@ -4,7 +4,6 @@ A text of readings is known by its titles, or is EuRoC's `t, gyroscope, accelero
 ROS bag is of `sensor_msgs/Imu`.
 """
 
-import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -95,26 +94,6 @@ class InertialLog(NamedTuple):
         ends = np.stack([np.interp(at, own, x) for x in both.T], axis=1)
         pieces = (ends[1:] + ends[:-1]) / 2
         return np.diff(at), pieces[:, :3], pieces[:, 3:]
-
-    def frames(
-        self, times: Float[np.ndarray, " k"]
-    ) -> tuple[Float[np.ndarray, "s m"], Float[np.ndarray, "s m 3"], Float[np.ndarray, "s m 3"]]:
-        """The pieces of `between` from each frame to the next, s = k − 1, as many for all: zeros
-        after the last, which last 0 s.
-
-        `times` are by the clock of the IMU, that of the camera plus `clock_offset`. Raises
-        ValueError, naming the frame to which no reading leads.
-        """
-        steps = []
-        for i, (start, end) in enumerate(itertools.pairwise(times)):
-            try:
-                steps.append(np.column_stack(self.between(float(start), float(end))))
-            except ValueError as error:
-                raise ValueError(f"from frame {i} to {i + 1}: {error}") from None
-        padded = np.zeros((len(steps), max(map(len, steps), default=0), 7))
-        for row, step in zip(padded, steps, strict=True):
-            row[: len(step)] = step
-        return padded[..., 0], padded[..., 1:4], padded[..., 4:]
 
 
 class InertialFiles(NamedTuple):

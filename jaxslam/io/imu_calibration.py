@@ -1,6 +1,6 @@
 """The calibration of an inertial sensor (IMU): its noise, and where it is on the camera.
 
-Files are those of Kalibr, OpenVINS, EuRoC (also TUM-VI) and ORB-SLAM3.
+Files are those of Kalibr, OpenVINS and EuRoC (also TUM-VI).
 """
 
 import warnings
@@ -10,22 +10,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.imu import InertialLog, inertial_files
+from jaxslam.io.imu import inertial_files
 from jaxslam.io.lens_files import numbers_of, yaml_keys
 from jaxslam.io.text import text_lines
 from jaxslam.io.tum import not_rigid
 
-_APART = 5.0
-"""Times that a density and the scatter of readings may differ by."""
 _DENSITIES = {
-    "gyroscope_noise_density": ("IMU.NoiseGyro", "rad/s/√Hz", 0.1),
-    "gyroscope_random_walk": ("IMU.GyroWalk", "rad/s²/√Hz", 0.1),
-    "accelerometer_noise_density": ("IMU.NoiseAcc", "m/s²/√Hz", 1.0),
-    "accelerometer_random_walk": ("IMU.AccWalk", "m/s³/√Hz", 1.0),
+    "gyroscope_noise_density": ("rad/s/√Hz", 0.1),
+    "gyroscope_random_walk": ("rad/s²/√Hz", 0.1),
+    "accelerometer_noise_density": ("m/s²/√Hz", 1.0),
+    "accelerometer_random_walk": ("m/s³/√Hz", 1.0),
 }
-"""ORB-SLAM3's names of Kalibr's densities, their units, and more than any sensor has."""
-_RATES = ("update_rate", "rate_hz", "IMU.Frequency")
-_CAMERAS = {"T_cam_imu": False, **dict.fromkeys(("T_imu_cam", "IMU.T_b_c1.data", "Tbc.data"), True)}
+"""Kalibr's names of the densities, their units, and more than any sensor has."""
+_CAMERAS = {"T_cam_imu": False, "T_imu_cam": True}
 """Names of T_CI, and of its inverse."""
 _SHAPES = ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC", "gyroscopes.M", "accelerometers.M")
 """What OpenVINS and Kalibr call scale factors, misalignments and turns of the two sensors."""
@@ -49,37 +46,13 @@ class InertialCalibration(NamedTuple):
     clock_offset: float = 0.0
     """Seconds by which the clock of the IMU is ahead of the camera's, `t_imu = t_cam + offset`, as
     Kalibr's `timeshift_cam_imu`."""
-    update_rate: float | None = None
-    """Readings in a second, Hz, where the file states them."""
-
-    def compared(self, log: InertialLog) -> tuple[str, ...]:
-        """A sentence for each density of white noise that is five times more, or less, than that of
-        a log at its calmest; of a standard deviation per reading among others.
-
-        Of white noise of density n, readings δ s apart differ by σ = n √(2/δ) from one to the next;
-        that of the calmest tenth of its seconds is taken, in which there is the least motion.
-        """
-        notes, step = [], float(np.median(np.diff(log.times)))
-        for sensor in ("gyroscope", "accelerometer"):
-            squares = (np.diff(getattr(log, sensor), axis=0) ** 2).mean(axis=1)
-            count = min(max(round(1 / step), 1), len(squares))
-            of_seconds = squares[: len(squares) // count * count].reshape(-1, count).mean(axis=1)
-            seen = np.sqrt(np.quantile(of_seconds, 0.1) * step / 2)
-            what, stated = f"{sensor}_noise_density", getattr(self, f"{sensor}_noise_density")
-            why = f"if it is the σ of a reading, divide it by √rate, {step**-0.5:.3g}"
-            if stated < seen:
-                why = "from vibration or a worse sensor: a filter trusts it too much"
-            if not seen / _APART <= stated <= seen * _APART:
-                told = f"{what} is {stated:.3g}, but the calmest readings of {log.name} scatter"
-                notes.append(f"{told} as of {seen:.3g}; {why}")
-        return tuple(notes)
 
 
 def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     """Read the calibration of an IMU from files, or folders of pictures with them, taken together.
 
-    Densities are those of Kalibr's `imu.yaml`, OpenVINS' `kalibr_imu_chain.yaml`, EuRoC's
-    `imu0/sensor.yaml` or ORB-SLAM3's settings. The camera is at T_CI, the `T_cam_imu` of Kalibr's
+    Densities are those of Kalibr's `imu.yaml`, OpenVINS' `kalibr_imu_chain.yaml` or EuRoC's
+    `imu0/sensor.yaml`. The camera is at T_CI, the `T_cam_imu` of Kalibr's
     camchain (or the inverse of `T_imu_cam`), after the inverse of the IMU's `T_i_b` where there is
     one; or at T_BC⁻¹ T_BI, the two `T_BS` of EuRoC, whose body is the IMU where it states none.
     Raises ValueError for what is missing, or implausible, by its name, and warns of scale factors
@@ -94,8 +67,7 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     for file in files:
         text_lines(file, "calibration")  # which says what cannot be read
         fields = yaml_keys(file.read_text(encoding="utf-8-sig", errors="replace"))
-        of_imu = any({name, other} & fields.keys() for name, (other, *_) in _DENSITIES.items())
-        (sensor if of_imu else mount).update(fields)
+        (sensor if _DENSITIES.keys() & fields.keys() else mount).update(fields)
     place = ", ".join(map(str, files or paths))
     densities = [_density(place, sensor, name) for name in _DENSITIES]
     T_CI = _camera_from_imu(place, sensor, mount)
@@ -109,13 +81,12 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
         told = f"{', '.join(uneven)} of the IMU are not applied to its readings"
         warnings.warn(f"{place}: {told}; apply them before", stacklevel=2)
     shift = numbers_of((sensor | mount).get("timeshift_cam_imu"))
-    rate = next((x[0] for key in _RATES if (x := numbers_of(sensor.get(key)))), None)
-    return InertialCalibration(*densities, T_CI, shift[0] if shift else 0.0, rate)
+    return InertialCalibration(*densities, T_CI, shift[0] if shift else 0.0)
 
 
 def _density(place: str, fields: dict[str, object], name: str) -> float:
-    other, unit, most = _DENSITIES[name]
-    found = numbers_of(fields.get(name, fields.get(other)))
+    unit, most = _DENSITIES[name]
+    found = numbers_of(fields.get(name))
     if len(found) != 1 or not 0 <= found[0] <= most or (found[0] == 0 and "noise" in name):
         told = f"{name} is {found[0]:g}" if found else f"{name} is missing"
         raise ValueError(

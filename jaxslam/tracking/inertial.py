@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import jax
@@ -58,7 +59,11 @@ class Inertial:
         assert isinstance(imu, Imu)
         made = cls(log, imu, clock_offset or 0.0)
         begin, until = float(times[0]), float(min(times[0] + BEGINNING, times[-1]))
-        log.frames(times + made.clock_offset)
+        for i, step in enumerate(itertools.pairwise(times.tolist())):
+            try:
+                made._between(*step)
+            except ValueError as error:
+                raise ValueError(f"from frame {i} to {i + 1}: {error}") from None
         with jax.enable_x64(True):
             readings = made._between(begin, until)
             try:

@@ -178,19 +178,6 @@ def test_pieces_have_the_integral_of_a_signal_that_is_linear_between_readings():
         np.testing.assert_allclose(total, whole[0] @ whole[i], rtol=0, atol=1e-14)
 
 
-def test_frames_are_intervals_of_one_length_that_zeros_fill():
-    times = np.array([0.0, 0.033, 0.1, 0.104, 0.2])
-    seconds, rates, forces = LOG.frames(times)
-    assert seconds.shape == (4, 20)
-    np.testing.assert_allclose(seconds.sum(axis=1), np.diff(times), rtol=0, atol=1e-15)
-    for i in range(4):
-        own = LOG.between(times[i], times[i + 1])
-        for found, wanted in zip((seconds[i], rates[i], forces[i]), own, strict=True):
-            np.testing.assert_array_equal(found[: len(wanted)], wanted)
-            assert not found[len(wanted) :].any()
-    assert LOG.frames(times[:1])[1].shape == (0, 0, 3)
-
-
 GAP = inertial_log("mine", np.delete(np.column_stack([SINCE, RATES, FORCES]), range(50, 90), 0))
 
 
@@ -207,8 +194,8 @@ def of_rows(**how):
     return lambda _: inertial_log("mine", changed(**how), 1.0)
 
 
-def of_frames(log, *times):
-    return lambda _: log.frames(np.array(times))
+def between(log, start, end):
+    return lambda _: log.between(start, end)
 
 
 @pytest.mark.parametrize(
@@ -228,18 +215,12 @@ def of_frames(log, *times):
         (of_rows(rows=slice(None, None, -1)), r"200 of 201 stamps go back, the first from"),
         (of_rows(rows=slice(2)), "2 readings; expected at least three, each"),
         (of_rows(rows=slice(None, None, 30)), r"readings are 0\.15 s apart; expected an IMU of"),
-        (
-            of_frames(LOG, -0.1, 0.1, 0.2),
-            "frame 0 to 1: the log: readings from 0.0* s to 1.0* s do",
-        ),
-        (of_frames(LOG, 0.8, 0.9, 1.1), r"1 to 2: .* do not cover those from 0\.9\d* s to 1\.1"),
-        (of_frames(LOG, EPOCH + 0.5, EPOCH + 1.5), "from frame 0 to 1: .*; the clocks differ"),
-        (of_frames(LOG, 0.1, 0.3, 0.2), "from frame 1 to 2: .* from 0.3 s to 0.2 s is empty"),
-        (of_frames(LOG, 0.1, np.nan), "from frame 0 to 1: .* is empty"),
-        (
-            of_frames(GAP, 0.2, 0.3, 0.4, 0.5),
-            r"frame 1 to 2: mine: no readings from 0\.245\d* s to",
-        ),
+        (between(LOG, -0.1, 0.1), r"the log: readings from 0\.0* s to 1\.0* s do not cover"),
+        (between(LOG, 0.9, 1.1), r"do not cover those from 0\.9\d* s to 1\.1"),
+        (between(LOG, EPOCH + 0.5, EPOCH + 1.5), "the clocks differ"),
+        (between(LOG, 0.3, 0.2), "from 0.3 s to 0.2 s is empty"),
+        (between(LOG, 0.1, np.nan), "is empty"),
+        (between(GAP, 0.3, 0.4), r"mine: no readings from 0\.245\d* s to"),
     ],
 )
 def test_what_no_imu_measures_is_refused_with_what_to_do(read, message, tmp_path):
@@ -249,9 +230,9 @@ def test_what_no_imu_measures_is_refused_with_what_to_do(read, message, tmp_path
 
 
 def test_a_gap_is_bridged_and_ends_may_be_off_by_what_doubles_round():
-    seconds, rates, _ = GAP.frames(np.array([0.2, 0.3, 0.5]))
-    np.testing.assert_allclose(seconds.sum(axis=1), [0.1, 0.2], rtol=1e-12)
-    assert rates[..., 1] == pytest.approx(np.where(seconds > 0, 0.1, 0.0))
+    seconds, rates, _ = GAP.between(0.2, 0.5)
+    assert seconds.sum() == pytest.approx(0.3, rel=1e-12)
+    assert rates[:, 1] == pytest.approx(0.1)
     log = InertialLog(TIMES, RATES, FORCES)
     seconds, rates, _ = log.between(TIMES[0] - 5e-7, TIMES[-1] + 5e-7)
     whole = log.between(TIMES[0], TIMES[-1])
