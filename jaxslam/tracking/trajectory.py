@@ -1,7 +1,5 @@
-"""Trajectories and their covariances as text, and their error against a reference."""
+"""The error of a trajectory against a reference, and that whose covariances are written."""
 
-from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple, TypedDict
 
 import numpy as np
@@ -9,19 +7,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
 from jaxslam.tracking.pose_with_covariance import Positions
 
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
-
-_GIVEN_SCALE = (
-    "in the unit of each map; the unit itself is uncertain by sigma_log_scale (frames.csv) and "
-    "approximate where unit_fixed is 0"
-)
-_KNOWN_SCALE = "in the unit of each map, which the filter takes as exactly known"
 
 
 class TrajectoryError(TypedDict):
@@ -44,27 +35,6 @@ class RelativeError(TypedDict):
     translation: float
     rotation: float
     way: float
-
-
-def write_covariances(
-    path: str | Path,
-    times: ArrayLike,
-    covariances: ArrayLike,
-    *,
-    given_scale: bool = False,
-    length: str = "map",
-    caveat: str = "",
-) -> None:
-    """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
-
-    They are of poses in the unit of their map, or of `length`; different units of different maps
-    are not in them.
-    With `given_scale` the filter has a unit of its own whose size in metres is uncertain. Otherwise
-    it takes its unit for exactly known. The header says which, and the caveat if there is one.
-    """
-    convention = replace(TRACKED, scale="given" if given_scale else "marginal")
-    remark = "; ".join(filter(None, [_GIVEN_SCALE if given_scale else _KNOWN_SCALE, caveat]))
-    write_pose_covariances(path, times, covariances, convention, length=length, remark=remark)
 
 
 def absolute_trajectory_error(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam._runtime.files import write_json, write_text
+from jaxslam.evaluation import write_covariances
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.source import Frame, Source
 from jaxslam.plots.tracking import plot_map
@@ -32,8 +34,14 @@ from jaxslam.tracking.summary import (
 )
 from jaxslam.tracking.target import Target
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import absolute_trajectory_error, write_covariances
+from jaxslam.tracking.trajectory import TRACKED, absolute_trajectory_error
 from jaxslam.tracking.viewer import Viewer
+
+_GIVEN_SCALE = (
+    "in the unit of each map; the unit itself is uncertain by sigma_log_scale (frames.csv) and "
+    "approximate where unit_fixed is 0"
+)
+_KNOWN_SCALE = "in the unit of each map, which the filter takes as exactly known"
 
 
 def track(
@@ -154,17 +162,15 @@ def _write(
     for name, text in TEXTS.items():
         write_text(out / name, text(history))
     tracker.save(out / "map.npz")
-    times = [result.time for result in history]
     scaled = any(result.sigma_log_scale is not None for result in history)
-    covariances = [result.covariance for result in history]
-    caveat = caveat_of(tracker)
+    remark = _GIVEN_SCALE if scaled else _KNOWN_SCALE
     write_covariances(
         out / "covariance.txt",
-        times,
-        covariances,
-        given_scale=scaled,
+        [result.time for result in history],
+        [result.covariance for result in history],
+        replace(TRACKED, scale="given" if scaled else "marginal"),
         length=tracker.unit,
-        caveat=caveat,
+        remark="; ".join(filter(None, [remark, caveat_of(tracker)])),
     )
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:

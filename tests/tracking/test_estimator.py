@@ -117,23 +117,6 @@ def test_each_innovation_given_all_others_is_what_they_leave_of_it(estimated):
         np.testing.assert_allclose(one @ one, left @ np.linalg.solve(P, left), rtol=1e-8)
 
 
-def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimated):
-    estimator, state_before = estimated
-    slots, aside = np.array([0, 2, 6]), np.array([[0.2, 0.1], [0.0, -0.3], [0.4, 0.0]])
-    with jax.enable_x64(True):
-        predicted = estimator.predict(state_before, 1 / 30)
-        pixels = jnp.array(predicted.view.pixels[slots] + aside)
-        features = Features(jnp.array(slots), pixels, jnp.ones(3, bool), jnp.full(3, 4.0))
-        at = predicted.gaussian, predicted.control
-        state, _ = quick_jit(lambda *at: estimator.slam.update(*at, features))(*at)
-        sensor = replace(estimator.slam.sensor, sigma=2 * SMALL.pixel_sigma)
-        worse = replace(estimator.slam, sensor=sensor)
-        plain = replace(features, noise_factor=None)
-        other, _ = quick_jit(lambda *at: worse.update(*at, plain))(*at)
-    np.testing.assert_allclose(state.covariance, other.covariance, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(state.landmarks, other.landmarks, rtol=1e-9)
-
-
 def test_a_motion_that_computes_its_noise_is_predicted_as_it_is(estimated, monkeypatch):
     """One of one's own, which has no σ to make larger."""
     estimator, state = estimated

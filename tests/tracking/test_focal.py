@@ -51,9 +51,7 @@ def given(factor=1.0, k1=0.0):
     return replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor, distortion=distortion)
 
 
-@pytest.mark.parametrize(
-    ("factor", "k1"), [(1.0, 0.0), (0.8, 0.0), (1.0, -0.08), (1.2, 0.08), (0.8, 0.08)]
-)
+@pytest.mark.parametrize(("factor", "k1"), [(1.0, 0.0), (1.0, -0.08), (1.2, 0.08)])
 def test_the_lens_that_fits_is_found(factor, k1):
     found = better_lens(*video(turn=0.3), given(factor, k1))
     assert (found.left < 0.6 * CLEAR) == ((factor, k1) != (1.0, 0.0))

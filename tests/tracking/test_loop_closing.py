@@ -113,22 +113,6 @@ def test_a_camera_that_returns_closes_loops_which_correct_its_way(walk):
 
 
 @pytest.mark.slow
-def test_submaps_and_loops_are_saved_and_go_on(walk):
-    """A part of them that is not saved."""
-    tracker, history, source, path = walk
-    again = Tracker.load(path)
-    assert len(again.map.submaps) >= 5
-    assert len(again.map.loops) >= 1
-    last = [again.track(frame) for frame in list(source)[-10:]]
-    assert np.array_equal([one.T_wc for one in last], [one.T_wc for one in history[-10:]])
-    assert np.array_equal(
-        [one.covariance for one in last], [one.covariance for one in history[-10:]]
-    )
-    ours, theirs = (one.smoothed(history)[0] for one in (again, tracker))
-    assert np.array_equal([one.T_wc for one in ours], [one.T_wc for one in theirs])
-
-
-@pytest.mark.slow
 def test_another_video_may_begin_anywhere_in_a_saved_map(walk):
     """Near the far end of the walk, which the latest submap does not show."""
     *_, source, path = walk

@@ -131,14 +131,6 @@ def test_a_patch_that_is_not_seen_as_it_was_expected_is_where_it_is(warp):
     assert np.median(errors) < 0.06
 
 
-def test_match_does_not_depend_on_gain_and_offset():
-    template = Patch.take(picture(sigma=0.0), CENTRE).warped(np.eye(2))
-    bright = cv2.convertScaleAbs(picture(shift=(2.3, -1.6), sigma=0.0), alpha=0.5, beta=100)
-    match = match_patch(bright, template, CENTRE, np.eye(2) * 4)
-    assert match is not None
-    np.testing.assert_allclose(match.pixel, [62.3, 58.4], atol=0.05)
-
-
 def test_only_the_ellipse_is_searched():
     template = Patch.take(picture(), CENTRE).warped(np.eye(2))
     image = picture(shift=(6.0, 0.0))
@@ -151,13 +143,6 @@ def test_only_the_ellipse_is_searched():
     assert match_patch(diagonal, template, CENTRE, tilt) is not None
     assert match_patch(diagonal, template, CENTRE, tilt * [[1, -1], [-1, 1]]) is None
     assert match_patch(image, template, CENTRE, along * 100, max_radius=4.0) is None
-
-
-def test_certain_prediction_still_finds_its_pixel():
-    template = Patch.take(picture(), CENTRE).warped(np.eye(2))
-    match = match_patch(picture(shift=(0.4, 0.4), seed=1), template, CENTRE, np.eye(2) * 1e-4)
-    assert match is not None
-    np.testing.assert_allclose(match.pixel, CENTRE + 0.4, atol=0.1)
 
 
 def test_repeated_texture_is_ambiguous():
@@ -284,15 +269,6 @@ def test_likenesses_outside_of_a_wide_ellipse_do_not_count():
     match = match_patch(image, template, np.array([340.0, 260.0]), along)
     assert match is not None
     np.testing.assert_allclose(match.pixel, [u, v], atol=0.3)
-
-
-def test_a_patch_on_the_rim_of_a_wide_ellipse_is_found():
-    """Even where the nearest pixel of half the size is outside of it."""
-    reach, place = np.sqrt(9.21 * WIDE[0, 0]), np.array([320.0, 240.0])
-    template = Patch.take(texture(), place).warped(np.eye(2))
-    for angle in np.arange(0, 2 * np.pi, np.pi / 8):
-        centre = place + 0.999 * reach * np.array([np.cos(angle), np.sin(angle)])
-        assert match_patch(texture(), template, centre, WIDE, max_radius=200.0) is not None
 
 
 # --- corners --------------------------------------------------------------------------------------

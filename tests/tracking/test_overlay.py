@@ -62,12 +62,6 @@ def test_an_ellipse_reaches_three_sigma_along_its_axes_and_is_tilted_as_its_cova
         assert np.ptp(places) == pytest.approx(2 * LEAST_RADIUS + 3, abs=1.5)
 
 
-def test_match_is_drawn_at_its_pixel_and_joined_to_the_prediction():
-    overlay = draw([200.0, 60.0], np.eye(2), [240.0, 60.0], "matched")
-    drawn = {tuple(place) for place in coloured(overlay, "matched")}
-    assert {(60, 202), (60, 220), (60, 240), (61, 240)} <= drawn
-
-
 def test_every_status_has_a_shape_of_its_own():
     """Without colours: what is found at the same place in the same ellipse looks different."""
     there, wide = [200.0, 60.0], 36 * np.eye(2)
@@ -182,15 +176,6 @@ def test_what_is_given_aside_is_done_in_order_and_elsewhere():
     assert len(threads) == 1
     assert threading.current_thread() not in threads
     assert not any(thread.is_alive() for thread in threads)
-
-
-def test_an_interruption_leaves_nothing_undone():
-    done = []
-    with suppress(KeyboardInterrupt), Aside() as aside:
-        for number in range(4):
-            aside.give(lambda n: (time.sleep(0.01), done.append(n)), number)
-        raise KeyboardInterrupt
-    assert done == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("given", [1, 5 * WAITING])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.io.calibration import from_field_of_view
 from jaxslam.io.pictures import as_grey
 from jaxslam.tracking.persistence import save
 from jaxslam.tracking.settings import TrackerSettings
@@ -53,38 +52,6 @@ def test_a_tracker_is_a_fold_and_a_state_that_is_kept_is_gone_on_from_again(vide
     assert [(one.steps, one.created, one.map.number) for one in kept] == numbers
 
 
-@pytest.mark.slow
-def test_a_loaded_gaussian_sum_goes_on_digit_by_digit(video, tmp_path):
-    """A member of the sum, or a number of its unit, that is not saved."""
-    calibration, frames = video
-    settings = TrackerSettings(filter="scale_gauge+mixture3", wanted=12, spare=4, patience=2)
-    tracker = Tracker(calibration, settings)
-    for frame in frames[:HALF]:
-        image = frame.image.copy()
-        image[:, :160] *= frame.index == 0  # its landmarks are not found again, and are removed
-        tracker.step(image, frame.time)
-    assert tracker.deleted > 0
-    tracker.save(tmp_path / "tracker.npz")
-    assert [path.name for path in tmp_path.iterdir()] == ["tracker.npz"]
-    loaded = Tracker.load(tmp_path / "tracker.npz")
-    assert loaded.settings == tracker.settings
-    assert loaded.calibration == calibration
-    for frame in frames[HALF:]:
-        one, other = (each.step(frame.image, frame.time) for each in (tracker, loaded))
-        same(one, other)
-    assert one.status.count("matched") >= 8
-    assert np.linalg.eigvalsh(one.covariance)[0] > 0
-    # In a unit that nobody told, of which some is known.
-    assert 0.999 * settings.unit_sigma < (one.sigma_log_scale or 0) < 2
-    assert one.unit_fixed
-    assert one.log_scale is not None
-    assert abs(one.log_scale) < 1
-    for one, other in zip(tracker.points(), loaded.points(), strict=True):
-        np.testing.assert_array_equal(one, other)
-    for count in ("created", "deleted", "restarts", "steps", "failed"):
-        assert getattr(tracker, count) == getattr(loaded, count), count
-
-
 def test_what_several_records_share_is_written_once_and_shared_again(video, tmp_path):
     calibration, frames = video
     tracker = Tracker(calibration, SETTINGS)
@@ -98,22 +65,6 @@ def test_what_several_records_share_is_written_once_and_shared_again(video, tmp_
     assert again.left[1].landmarks[2] is again.map.landmarks[2]
     sizes = [(tmp_path / name).stat().st_size for name in ("once.npz", "t.npz")]
     assert sizes[1] < 1.1 * sizes[0]
-
-
-@pytest.mark.slow
-def test_a_calibration_that_is_estimated_is_saved_with_it(video, tmp_path):
-    """A lens that is loaded as it was given."""
-    _, frames = video
-    tracker = Tracker(from_field_of_view(320, 240), SETTINGS)
-    for frame in frames[:HALF]:
-        tracker.track(frame)
-    tracker.save(tmp_path / "t.npz")
-    found, expected = Tracker.load(tmp_path / "t.npz").camera(), tracker.camera()
-    assert found is not None
-    assert expected is not None
-    assert found[0] == "estimated"
-    np.testing.assert_array_equal(found[1], expected[1])
-    np.testing.assert_array_equal(found[2], expected[2])
 
 
 def test_a_filter_of_ones_own_is_given_again(video, tmp_path):

@@ -9,7 +9,6 @@ from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.tracking import summary
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
 STATED = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0, sigma=(4.0, 3.0, 2.0, 1.0))
@@ -35,30 +34,6 @@ def test_a_calibration_is_estimated_and_stated_sigmas_are_used(name, calibration
     assert type(treatment) is kind
     np.testing.assert_allclose(treatment.sigma, sigma, rtol=1e-12)
     assert TrackerSettings(filter="recommended") == TrackerSettings()
-
-
-@pytest.mark.slow
-def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
-    """A lens that is not estimated, or in another direction."""
-    source = synthetic_source(frames=45, width=320, height=240)
-    true = source.calibration.fx
-    guess = from_field_of_view(320, 240, 70.0)
-    tracker = Tracker(guess, TrackerSettings(filter="world", wanted=20, spare=4))
-    for frame in source:
-        tracked = tracker.track(frame)
-    assert tracked.state == "tracked"
-    camera = tracker.camera()
-    assert camera is not None
-    treatment, (fx, fy, cx, cy, *_), covariance = camera
-    assert treatment == "estimated"
-    assert fx == fy
-    # Measured: of 34 pixels 11 to 20 are left after 1.5 seconds, from a guess with a σ of 11. One
-    # of three seeds ends farther off than the guess: so short a video tells little of the lens.
-    assert abs(fx - true) < 0.7 * abs(guess.fx - true)
-    assert np.sqrt(covariance[0, 0]) < 0.5 * guess.sigma[0]
-    # Two σ of the guess; measured: 16 and 16 pixels.
-    assert abs(cx - 159.5) < 25.6
-    assert abs(cy - 119.5) < 25.6
 
 
 def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_without_sigma():
@@ -93,13 +68,3 @@ def test_an_estimated_or_considered_lens_is_told_with_its_sigma(monkeypatch):
     lens = summary._lens(tracker)
     assert list(lens) == ["fx", "fy", "cx", "cy", "k1", "k2"]
     assert lens["k1"] == {"value": 0.0, "sigma": pytest.approx(0.15)}
-
-
-def test_a_known_camera_is_reported_as_it_is():
-    tracker = of_camera(PLAIN, "known")
-    camera = tracker.camera()
-    assert camera is not None
-    assert camera[0] == "known"
-    np.testing.assert_array_equal(camera[1], [500.0, 500.0, 320.0, 240.0])
-    np.testing.assert_array_equal(camera[2], 0.0)
-    assert summary._lens(tracker) == {}

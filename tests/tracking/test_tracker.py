@@ -25,10 +25,8 @@ from jaxslam.io.opening import open_source
 from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
 from jaxslam.tracking import estimator as programs
-from jaxslam.tracking import policy as policies
 from jaxslam.tracking import tracker as trackers
 from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.policy import LEAST_MATCHES
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -73,6 +71,10 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     eigenvalues = np.linalg.eigvalsh(covariances)
     assert np.all(eigenvalues[1:, 0] > 1e-8 * eigenvalues[1:, -1])
     assert not covariances[0].any()
+    header = (out / "covariance.txt").read_text().splitlines()[0]
+    for word in ("scale=marginal", "length=map", "which the filter takes as exactly known)"):
+        assert word in header
+    assert "in the unit of each map" in (out / "trajectory.txt").read_text().splitlines()[0]
     ate = absolute_trajectory_error(times, T_wc, *source.reference)
     assert ate["rmse"] == pytest.approx(summary["ate"]["rmse"], rel=1e-3)
     assert json.loads((out / "summary.json").read_text())["frames"] == FRAMES
@@ -274,22 +276,6 @@ def changed(tracker, **fields):
     tracker.state = tracker.state.with_map(state=state)
 
 
-def test_matches_too_few_to_believe_change_nothing(under_way, monkeypatch):
-    tracker, frame = under_way
-    kept = tracker.state
-    whole = tracker.track(frame)
-    agreed = whole.status.count("matched")
-    assert agreed > LEAST_MATCHES
-    for least in (agreed, agreed + 1):
-        tracker.state = kept
-        monkeypatch.setattr(policies, "more_than_chance", lambda *_, least=least: least)
-        result = tracker.track(frame)
-        assert result.status.count("matched") == (agreed if least == agreed else 0)
-    assert result.lost
-    assert (result.nis, result.nis_dof) == (0, 0)
-    assert np.linalg.det(result.covariance) > 1e6 * np.linalg.det(whole.covariance)
-
-
 def test_a_world_behind_the_camera_is_given_up(under_way):
     tracker, frame = under_way
     state = tracker.map.state
@@ -426,20 +412,6 @@ def test_darkness_before_the_first_map_is_no_repeated_picture(once):
 
 
 # --- slow: what only longer videos, other filters and real pictures show --------------------------
-
-
-@pytest.mark.slow
-def test_the_synthetic_camera_is_tracked(tmp_path):
-    """A drift of rotation or scale, which needs a longer way."""
-    settings = TrackerSettings(filter="world", wanted=30)
-    summary = track(synthetic_source(frames=45), tmp_path, settings)
-    assert summary["tracked"] == summary["frames"] == 45
-    assert summary["restarts"] == 0
-    assert summary["matches_per_frame"] > 20
-    # Measured 0.5 %; a tracker that loses rotation or scale is above 5 %.
-    assert summary["ate"]["rmse"] < 0.02 * summary["ate"]["path_length"]
-    # Matches are rejected by χ², so that their NIS is below its number; 4 would be a wrong σ.
-    assert 0.1 < summary["nis"]["mean"] / summary["nis"]["dof"] < 2
 
 
 @pytest.mark.slow

@@ -13,11 +13,7 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import render, room, synthetic_source
 from jaxslam.tracking.target import KnownPoint, Target, read_target
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import (
-    absolute_trajectory_error,
-    relative_pose_error,
-    write_covariances,
-)
+from jaxslam.tracking.trajectory import absolute_trajectory_error, relative_pose_error
 from jaxslam.tracking.video import track
 
 SMALL = TrackerSettings(filter="world", wanted=12, spare=4)
@@ -124,7 +120,6 @@ READ = [
 ]
 WRITTEN = [
     (lambda x: write_tum(x / "t.txt", [0, 1], np.eye(4)[None]), "2 times for 1 poses"),
-    (lambda x: write_covariances(x / "c", [0, 1], np.eye(6)[None]), "2 times for 1 covariances"),
     (film("overlay.gif"), r"must end in \.mp4"),
     (film("missing/overlay.mp4"), "cannot be opened"),
     (film("overlay.mp4", np.zeros((48, 66, 3), np.uint8)), "does not fit"),

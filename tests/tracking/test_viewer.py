@@ -79,24 +79,6 @@ def test_what_was_sought_and_found_is_recorded(recorded):
     assert sum(map(len, created)) == summary["landmarks"]["created"]
 
 
-def test_an_interruption_leaves_what_was_seen(tmp_path):
-    pytest.importorskip("rerun")
-
-    def stop(frames):
-        nonlocal seen
-        seen += frames
-        if seen == 2:
-            raise KeyboardInterrupt
-
-    seen, path = 0, tmp_path / "seen.rrd"
-    source = synthetic_source(frames=FRAMES, width=160, height=120)
-    with pytest.raises(KeyboardInterrupt):
-        track(source, tmp_path, SETTINGS, viewer=path, overlay=False, progress=stop)
-    rows = read(path)
-    assert [row["frame"] for row in rows["/world/camera"]] == [0, 1]
-    assert [row["frame"] for row in rows["/world/landmarks"]] == [1]
-
-
 def test_ends_of_submaps_and_loops_to_them_are_recorded(tmp_path):
     pytest.importorskip("rerun")
     source = synthetic_source(frames=5, width=160, height=120)
