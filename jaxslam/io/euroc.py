@@ -4,29 +4,25 @@ Burri et al., IJRR 2016. The truth is of the body; the camera is at T_BS in it. 
 `sensor.yaml`; its lens is in `dso/camchain.yaml`.
 """
 
-import re
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
-from jaxslam._runtime.files import one_line
-from jaxslam.io.lens_files import read_calibration
+from jaxslam.io.imu_calibration import pose_of_keys
+from jaxslam.io.lens_files import read_calibration, yaml_keys
 from jaxslam.io.recording import (
     Layout,
     Recording,
-    check_rigid,
     fixed,
     listed,
     of_files,
     read_timestamps,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.text import numbers, read_table, text_lines
-from jaxslam.io.tum import poses
+from jaxslam.io.text import read_table
+from jaxslam.io.tum import rows_as_poses
 
 NANOSECONDS = 1e9
 TRUTH = "state_groundtruth_estimate0"
+KEY = "T_BS.data"
 
 
 def _open(path: Path, _rate: float) -> Recording:
@@ -49,25 +45,13 @@ def _root(path: Path) -> Path:
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
-    T_BS = np.reshape(_numbers(yaml, "\n".join(text_lines(yaml).values()), "data", 16), (4, 4))
-    check_rigid(yaml, T_BS[None])
+    T_BS = pose_of_keys(yaml, yaml_keys(yaml.read_text(encoding="utf-8-sig")), {KEY: False})
+    if T_BS is None:
+        raise ValueError(f"{yaml}: {KEY}: [16 finite numbers] is missing")
     columns = "eight finite numbers ns px py pz qw qx qy qz"
-    table = read_table(truth, "truth", "poses", columns).numbers(columns, range(8))
-    try:
-        T_WB = poses(table[:, 1:4], table[:, [5, 6, 7, 4]])
-    except ValueError as error:
-        raise ValueError(f"{truth}: {one_line(error)}") from None
-    check_rigid(truth, T_WB)
-    return Trajectory(table[:, 0] / NANOSECONDS, T_WB @ T_BS)
-
-
-def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, " n"]:
-    """The list of numbers `key: [1, 2, …]`, over as many lines as it takes."""
-    found = re.search(rf"^{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    told = numbers(found[1].split(",") if found else [], count)
-    if told is None:
-        raise ValueError(f"{path}: {key}: [{count} finite numbers] is missing")
-    return np.array(told)
+    table = read_table(truth, "truth", "poses", columns)
+    rows = table.numbers(columns, (0, 1, 2, 3, 5, 6, 7, 4))
+    return Trajectory(rows[:, 0] / NANOSECONDS, rows_as_poses(table.place, rows) @ T_BS)
 
 
 EUROC = Layout(

@@ -100,21 +100,21 @@ def _camera_from_imu(
     place: str, sensor: dict[str, object], mount: dict[str, object]
 ) -> Float[np.ndarray, "4 4"]:
     """T_CI by the keys of an IMU and of a camera. Raises ValueError where there is none."""
-    T_CB = _pose(place, sensor | mount, _CAMERAS)
+    T_CB = pose_of_keys(place, sensor | mount, _CAMERAS)
     of_body = {"T_i_b": True}
     if T_CB is None:
-        T_CB, of_body = _pose(place, mount, {"T_BS.data": True}), {"T_BS.data": False}
+        T_CB, of_body = pose_of_keys(place, mount, {"T_BS.data": True}), {"T_BS.data": False}
     if T_CB is None:
         raise ValueError(
             f"{place}: the pose of the camera is missing; expected T_cam_imu of Kalibr's camchain, "
             "OpenVINS' T_imu_cam, or EuRoC's cam0/sensor.yaml (T_BS)"
         )
-    T_BI = _pose(place, sensor, of_body)
+    T_BI = pose_of_keys(place, sensor, of_body)
     return T_CB if T_BI is None else T_CB @ T_BI
 
 
-def _pose(
-    place: str, fields: dict[str, object], names: dict[str, bool]
+def pose_of_keys(
+    place: object, fields: dict[str, object], names: dict[str, bool]
 ) -> Float[np.ndarray, "4 4"] | None:
     """The first pose of these names, inverted where that is said; None without one."""
     name = next((x for x in names if len(numbers_of(fields.get(x))) == 16), "")

@@ -24,6 +24,8 @@ GATE = 9.21
 """The 99 % quantile of χ² with two degrees of freedom."""
 THRESHOLD = 0.8
 """Least correlation of a match."""
+AMBIGUITY = 0.05
+"""By how much more than a second place of a narrow ellipse a match correlates at least."""
 _MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
 _PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
 _MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
@@ -69,37 +71,32 @@ def match_patches(
     centres: Places,
     covariances: Float[np.ndarray, "n 2 2"],
     *,
-    max_radius: float | None = None,
-    ambiguity: float = 0.05,
     several: bool = True,
 ) -> Matches:
     """Active search: the places most like each template within the ellipse of its prediction.
 
     The ellipse is (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
-    degrees of freedom), cut at `max_radius` pixels from the centre along each axis (by default a
-    quarter of the image's width). Peaks of the zero-mean normalised cross-correlation in it are
-    refined to sub-pixel accuracy. In a narrow ellipse that is the
-    best peak; none where it does not reach `THRESHOLD`, or where a second one comes within
-    `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
-    the size, and around the highest peaks there again in the whole one. As the best of many peaks
-    often is another place, `several` are given, up to `PEAKS`, best first, for who knows what else
-    was found to choose from. None where the ellipse is outside the image.
+    degrees of freedom), cut at a quarter of the image's width from the centre along each axis.
+    Peaks of the zero-mean normalised cross-correlation in it are refined to sub-pixel accuracy. In
+    a narrow ellipse that is the best peak; none where it does not reach `THRESHOLD`, or where a
+    second one comes within `AMBIGUITY` of its score. A wide ellipse is searched in the image of
+    half the size, and around the highest peaks there again in the whole one. As the best of many
+    peaks often is another place, `several` are given, up to `PEAKS`, best first, for who knows what
+    else was found to choose from. None where the ellipse is outside the image.
     """
     if not len(templates):
         return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances)
-    # An ellipse is searched no further from its centre than a quarter of the picture's width.
-    reach = 0.25 * image.shape[1] if max_radius is None else max_radius
-    boxes = _boxes_around(ellipses, reach, half, image.shape)
-    least = THRESHOLD - ambiguity
+    boxes = _boxes_around(ellipses, half, image.shape)
+    least = THRESHOLD - AMBIGUITY
     wide = boxes.owner[boxes.large()]
     boxes = _narrowed(image, templates, ellipses, boxes, least)
     peaks = _peaks(whole, templates, boxes, least)
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    both = _alone(peaks.only(~in_wide), ambiguity), _several(peaks.only(in_wide))
+    both = _alone(peaks.only(~in_wide)), _several(peaks.only(in_wide))
     chosen = _Peaks(*map(np.concatenate, zip(*both, strict=True)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
@@ -258,13 +255,11 @@ class _Boxes(NamedTuple):
         return self.only(np.all(self.sizes >= 3, axis=1))
 
 
-def _boxes_around(
-    ellipses: _Ellipses, max_reach: float, half: int, shape: tuple[int, ...]
-) -> _Boxes:
+def _boxes_around(ellipses: _Ellipses, half: int, shape: tuple[int, ...]) -> _Boxes:
     """Return what to score for each ellipse: all of it, and one pixel more all around to tell a
     peak on the rim by; as far as windows of `half` pixels to each side are within the picture."""
     some = np.flatnonzero(np.isfinite(ellipses.centres + ellipses.reach()).all(axis=1))
-    middle, reach = ellipses.centres[some], np.minimum(ellipses.reach()[some], max_reach)
+    middle, reach = ellipses.centres[some], np.minimum(ellipses.reach()[some], 0.25 * shape[1])
     last = np.array(shape[::-1]) - 1 - half
     # Clipped as numbers, which have no greatest one, before they are whole.
     low = np.clip(np.floor(middle - reach) - 1, half, last + 1).astype(int)
@@ -304,13 +299,13 @@ def _peaks(image: Grey, templates: Windows, boxes: _Boxes, least: float) -> _Pea
     return found.only(found.scores == around.max(axis=1))
 
 
-def _alone(peaks: _Peaks, ambiguity: float) -> _Peaks:
+def _alone(peaks: _Peaks) -> _Peaks:
     """The best peak of each patch, of those that have one which is high enough and alone; of peaks
     in order of patches, best first."""
     _, first, of = np.unique(peaks.owner, return_index=True, return_inverse=True)
     best = peaks.only(first)
     apart = (np.abs(peaks.pixels - best.pixels[of]) > _APART).any(axis=1)
-    rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - ambiguity)]
+    rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - AMBIGUITY)]
     return best.only((best.scores >= THRESHOLD) & ~np.isin(best.owner, rivals))
 
 

@@ -20,18 +20,18 @@ def write_ply(
     points: ArrayLike,
     covariances: ArrayLike,
     ids: ArrayLike,
-    maps: ArrayLike | None = None,
+    maps: ArrayLike,
 ) -> None:
     """Write points (n, 3) in map units in the world frame as ASCII PLY, whole or not at all.
 
     `covariances` (n, 3, 3) in units^2 become six properties (the upper triangle, row by row),
-    `ids` (n,) and `maps` (n,), the number of each point's map (0), whole numbers. Raises
+    `ids` (n,) and `maps` (n,), the number of each point's map, whole numbers. Raises
     `ValueError` where the numbers of rows differ or a point is not finite, which no viewer reads.
     """
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     covariances = np.asarray(covariances, dtype=float).reshape(-1, 3, 3)
     ids = np.asarray(ids, dtype=np.int64).reshape(-1)
-    maps = np.zeros_like(ids) if maps is None else np.asarray(maps, dtype=np.int64).reshape(-1)
+    maps = np.asarray(maps, dtype=np.int64).reshape(-1)
     if not len(points) == len(covariances) == len(ids) == len(maps):
         raise ValueError(
             f"{len(points)} points, {len(covariances)} covariances, {len(ids)} ids and "

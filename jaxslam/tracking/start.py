@@ -11,7 +11,7 @@ from jaxslam.filters.slam import Slam
 from jaxslam.models.frame import Robocentric, Submaps
 from jaxslam.tracking.pose_with_covariance import Places
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.target import Target, TargetObservation, known_depths
+from jaxslam.tracking.target import Target, TargetObservation
 
 
 def trackable(
@@ -54,8 +54,10 @@ def places_with_target(
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Return pixels to start landmarks at, of a target's points first and of the corners away from
     them; and mean and σ of 1/z of as many as are wanted."""
-    s = settings
+    s, others = settings, settings.wanted - len(seen.sigma)
     distances = np.linalg.norm(corners[:, None] - seen.pixels, axis=2)
     apart = corners[np.all(distances >= s.spacing, axis=1)]
     pixels = np.concatenate([seen.pixels, apart])[: s.wanted]
-    return pixels, known_depths(seen, s.wanted, float(s.depth.mean), float(s.depth.sigma))
+    means = np.append(seen.inverse_depths, np.full(others, float(s.depth.mean)))
+    sigmas = np.append(seen.sigma, np.full(others, float(s.depth.sigma)))
+    return pixels, (means[:, None], sigmas[:, None])

@@ -232,15 +232,6 @@ def _depth_sigma(
     return np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J))
 
 
-def known_depths(
-    sighting: TargetObservation, count: int, mean: float, sigma: float
-) -> tuple[Float[np.ndarray, "count 1"], Float[np.ndarray, "count 1"]]:
-    """Mean and σ of 1/z of so many new landmarks: the target's points, then others."""
-    others = count - len(sighting.sigma)
-    means = np.append(sighting.inverse_depths, np.full(others, mean))
-    return means[:, None], np.append(sighting.sigma, np.full(others, sigma))[:, None]
-
-
 def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Json]:
     """Return an entry of summary.json: lengths in metres, the target's frame in the first
     camera."""

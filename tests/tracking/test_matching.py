@@ -142,7 +142,6 @@ def test_only_the_ellipse_is_searched():
     tilt = np.array([[4.0, 3.6], [3.6, 4.0]])
     assert match_patch(diagonal, template, CENTRE, tilt) is not None
     assert match_patch(diagonal, template, CENTRE, tilt * [[1, -1], [-1, 1]]) is None
-    assert match_patch(image, template, CENTRE, along * 100, max_radius=4.0) is None
 
 
 def test_repeated_texture_is_ambiguous():
@@ -151,7 +150,6 @@ def test_repeated_texture_is_ambiguous():
     template = Patch.take(image, CENTRE).warped(np.eye(2))
     wide = np.diag([16.0, 1.0])
     assert match_patch(image, template, CENTRE, wide) is None
-    assert match_patch(image, template, CENTRE, wide, ambiguity=0.0) is not None
     assert match_patch(image, template, CENTRE, np.eye(2)) is not None
 
 
@@ -254,7 +252,6 @@ def test_of_a_texture_that_is_there_twice_in_a_wide_ellipse_both_places_are_told
     for there in (place, place + shift):
         assert min(np.linalg.norm(match.pixel - there) for match in places[:2]) < 0.1
     assert match_patch(image, template, centre, WIDE, several=False) is None
-    assert match_patch(image, template, centre, WIDE, several=False, ambiguity=0.0) is not None
     assert match_patch(image, template, place - np.array(shift) / 4, WIDE / 4) is not None
 
 

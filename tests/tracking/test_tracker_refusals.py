@@ -124,10 +124,10 @@ WRITTEN = [
     (film("missing/overlay.mp4"), "cannot be opened"),
     (film("overlay.mp4", np.zeros((48, 66, 3), np.uint8)), "does not fit"),
     (
-        lambda x: write_ply(x / "map.ply", np.zeros((2, 3)), np.eye(3)[None], [1, 2]),
+        lambda x: write_ply(x / "map.ply", np.zeros((2, 3)), np.eye(3)[None], [1, 2], [0, 0]),
         "2 points, 1 covariances",
     ),
-    (lambda x: write_ply(x / "map.ply", [[np.nan, 0, 0]], np.eye(3)[None], [1]), "not finite"),
+    (lambda x: write_ply(x / "map.ply", [[np.nan, 0, 0]], np.eye(3)[None], [1], [0]), "not finite"),
     (never_tracked, "without any frame"),
     (viewed("seen.rrd", rerun=False), r"needs the viewer extra \(rerun is missing\)"),
     (viewed("seen.mp4"), r"seen\.mp4: the name must end in \.rrd"),
