@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.board import Board, View
@@ -125,14 +125,10 @@ def covered(views: Iterable[View], calibration: Calibration) -> Bool[np.ndarray,
     """The cells of a grid over the picture that hold a corner."""
     cells = np.zeros(_CELLS[::-1], bool)
     for view in views:
-        column, row = _cell(view.pixels, calibration).T
+        place = (view.pixels + 0.5) * _CELLS / (calibration.width, calibration.height)
+        column, row = np.clip(place.astype(int), 0, np.array(_CELLS) - 1).T
         cells[row, column] = True
     return cells
-
-
-def _cell(pixels: np.ndarray, calibration: Calibration) -> Int[np.ndarray, "k 2"]:
-    place = (pixels + 0.5) * _CELLS / (calibration.width, calibration.height)
-    return np.clip(place.astype(int), 0, np.array(_CELLS) - 1)
 
 
 def drawn_coverage(calibrated: Calibrated) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,10 +1,9 @@
 """A live camera: `0` is the first that the system has."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Condition, Thread
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -35,7 +34,7 @@ class Live:
         """Pictures as they come. Raises ValueError where none comes for `PATIENCE` seconds."""
         with opened(self.number) as capture:
             begun = time.monotonic()
-            newest = _Newest(capture)
+            newest = _Newest(capture.read)
             try:
                 while True:
                     came, image = newest.wait(self.number)
@@ -45,23 +44,14 @@ class Live:
                 newest.stop()
 
 
-@runtime_checkable
-class Capture(Protocol):
-    """A source of pictures one after another, as `cv2.VideoCapture` does."""
-
-    def read(self) -> tuple[bool, np.ndarray]:
-        """Whether there is another one, and the picture."""
-        ...
-
-
 class _Newest:
-    """The newest picture of a capture, taken once."""
+    """The newest picture that is read, taken once."""
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, read: Callable[[], tuple[bool, np.ndarray | None]]) -> None:
         self._changed = Condition()
         self._picture: tuple[float, np.ndarray] | None = None
         self._running = True
-        self._thread = Thread(target=self._fetch, args=(capture,), daemon=True)
+        self._thread = Thread(target=self._fetch, args=(read,), daemon=True)
         self._thread.start()
 
     def wait(self, number: int) -> tuple[float, np.ndarray]:
@@ -76,11 +66,11 @@ class _Newest:
         self._running = False
         self._thread.join(PATIENCE)
 
-    def _fetch(self, capture: Capture) -> None:
+    def _fetch(self, read: Callable[[], tuple[bool, np.ndarray | None]]) -> None:
         while self._running:
-            found, image = capture.read()
+            found, image = read()
             with self._changed:
-                if found:
+                if image is not None and found:
                     self._picture = time.monotonic(), image
                 else:
                     self._running = False

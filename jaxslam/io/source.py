@@ -86,7 +86,14 @@ def selected(
 
     `start` is in seconds after the first frame. Raises ValueError for numbers that select none.
     """
-    _check_selection(source, start, every, frames)
+    for name, count in (("every", every), ("frames", frames)):
+        if count is not None and count < 1:
+            raise ValueError(f"{name} must be a positive whole number, not {count}")
+    if source.clock is not None and start:
+        raise ValueError(f"start is {start} s; a live camera starts when it is opened")
+    end = float(np.ptp(source.times)) if len(source) else 0.0
+    if not 0 <= start <= end:
+        raise ValueError(f"start is {start} s; {source.name} has frames from 0 to {end:.3f} s")
     since = source.times - source.times[:1]
     first = int(np.argmin(np.abs(since - start))) if len(since) else 0
     stop = None if frames is None else first + every * frames
@@ -98,17 +105,6 @@ def selected(
         first=source.first + first * source.every,
         every=source.every * every,
     )
-
-
-def _check_selection(source: Source, start: float, every: int, frames: int | None) -> None:
-    for name, count in (("every", every), ("frames", frames)):
-        if count is not None and count < 1:
-            raise ValueError(f"{name} must be a positive whole number, not {count}")
-    if source.clock is not None and start:
-        raise ValueError(f"start is {start} s; a live camera starts when it is opened")
-    end = float(np.ptp(source.times)) if len(source) else 0.0
-    if not 0 <= start <= end:
-        raise ValueError(f"start is {start} s; {source.name} has frames from 0 to {end:.3f} s")
 
 
 def resized(source: Source, factor: float) -> Source:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,20 +105,11 @@ def _names(record: type) -> list[str]:
     return [one.name for one in fields(record) if one.compare and one.name != "calibration"]
 
 
-@runtime_checkable
-class Resumable(Protocol):
-    """What has a state: that before the first frame, when it is new."""
-
-    state: TrackerState
-
-
-T = TypeVar("T", bound=Resumable)
-
-
 def load(
-    path: str | Path, make: Callable[[Calibration, TrackerSettings], T], *, own_filter: bool
-) -> T:
-    """Read the tracker in a file by `make`; `own_filter` if its filter is not in the settings.
+    path: str | Path, make: Callable[[Calibration, TrackerSettings], Any], *, own_filter: bool
+) -> Any:
+    """Read the tracker in a file; `make` makes a new one, whose `state` is then the one that was
+    saved. `own_filter` if its filter is not in the settings.
 
     Raises ValueError for a file that is none, or of another filter.
     """

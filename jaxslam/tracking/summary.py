@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from jaxslam._runtime.files import Json
 from jaxslam._version import __version__
-from jaxslam.io.calibration import INTRINSICS, MODELS, as_fields
+from jaxslam.io.calibration import INTRINSICS, MODELS, Calibration, as_fields
 from jaxslam.io.source import Source, Trajectory
 from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
@@ -54,14 +54,15 @@ def summarised(
     dof = sum(result.nis_dof for result in updates)
     count = max(len(updates), 1)
     later = seconds[WARM_UP:] or seconds or [0.0]
+    lens = _lens(tracker)
     summary = {
         "schema": 1,
         "version": __version__,
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": asdict(tracker.settings),
-        "calibration": _calibration(tracker, history, points),
-        "lens": _lens(tracker),
+        "calibration": _calibration(tracker, lens, history, points),
+        "lens": lens,
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -258,7 +259,9 @@ def _unit_line(unit: Summary) -> str:
     )
 
 
-def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -> Summary:
+def _calibration(
+    tracker: Tracker, lens: Summary, history: Sequence[Tracked], points: Points
+) -> Summary:
     """Return what the camera was taken for, and where it is estimated or considered, what it is in
     the end with σ: what is considered was found by the start, and left since. Where it is known,
     the lens that fits much better, if one does."""
@@ -267,11 +270,11 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -
     if camera is None:
         return {"given": given}
     result = {"treatment": camera[0], "given": given}
-    if lens := _lens(tracker):
+    if lens:
         for key, number in (("estimated", "value"), ("sigma", "sigma")):
             result[key] = {name: one[number] for name, one in lens.items() if name in INTRINSICS}
-    if caveat_of(tracker):
-        result["caveat"] = TOO_SURE
+    if caveat := caveat_of(camera[0], tracker.calibration):
+        result["caveat"] = caveat
     if not tracker.calibration.guessed:
         better = better_lens(history, points, tracker.calibration)
         if better.left < CLEAR:
@@ -279,11 +282,9 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -
     return result
 
 
-def caveat_of(tracker: Tracker) -> str:
-    """The caveat on a lens of which little was known."""
-    camera = tracker.camera()
-    estimated = camera is not None and camera[0] == "estimated"
-    return TOO_SURE if estimated and tracker.calibration.guessed else ""
+def caveat_of(treatment: str, calibration: Calibration) -> str:
+    """The caveat on a lens that is treated so, and of which little was known."""
+    return TOO_SURE if treatment == "estimated" and calibration.guessed else ""
 
 
 def _lens(tracker: Tracker) -> Summary:

@@ -164,13 +164,14 @@ def _write(
     tracker.save(out / "map.npz")
     scaled = any(result.sigma_log_scale is not None for result in history)
     remark = _GIVEN_SCALE if scaled else _KNOWN_SCALE
+    treatment, *_ = tracker.camera() or [""]
     write_covariances(
         out / "covariance.txt",
         [result.time for result in history],
         [result.covariance for result in history],
         replace(TRACKED, scale="given" if scaled else "marginal"),
         length=tracker.unit,
-        remark="; ".join(filter(None, [remark, caveat_of(tracker)])),
+        remark="; ".join(filter(None, [remark, caveat_of(treatment, tracker.calibration)])),
     )
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:

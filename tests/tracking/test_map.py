@@ -182,7 +182,8 @@ def test_a_filter_that_is_begun_anew_in_metres_goes_on_in_the_unit_of_its_map():
         empty=lambda _: "empty", predict=lambda *_: None, correct=lambda *_: ("broken", failed)
     )
     before: Any = Map("of before", MapInWorld(log_unit=0.3, log_scale=np.log(2.0)))
-    after = TrackerState(broken, CAMERA, before).coasted(SimpleNamespace(control=0.1))
+    predicted: Any = SimpleNamespace(control=0.1)
+    after = TrackerState(broken, CAMERA, before).coasted(predicted)
     assert after.map.state == "empty"
     assert after.map.place.unit == pytest.approx(0.5)
 
