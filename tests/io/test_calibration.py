@@ -67,14 +67,6 @@ def test_resized_keeps_directions_and_the_share_of_every_error():
     assert new.distortion == old.distortion
 
 
-def test_the_matrix_projects_as_a_pinhole_and_distortion_is_padded(tmp_path):
-    (tmp_path / "c.json").write_text(json.dumps(GOOD))
-    calibration = read_calibration(tmp_path / "c.json")
-    u, v, w = calibration.matrix @ np.array([0.4, -0.2, 2.0])
-    assert (u / w, v / w) == pytest.approx((525.0 * 0.2 + 308.5, 524.0 * -0.1 + 236.5))
-    assert calibration.distortion == (0.1, -0.2, 0, 0, 0)
-
-
 LENS = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, (0.1, -0.2, 0.01, 0.02))
 FOLDED = "[525.0, 0.,\n     308.5, 0., 524.0, 236.5, 0., 0., 1.]"
 K = "[525.0, 0, 308.5, 0, 524.0, 236.5, 0, 0, 1]"

@@ -116,22 +116,6 @@ def test_without_a_lens_it_is_guessed(tmp_path):
             assert open_source(bag).calibration.guessed
 
 
-@pytest.mark.parametrize(
-    ("told", "model", "count"),
-    [
-        ("equidistant", "fisheye", 4),
-        ("kannala_brandt", "fisheye", 4),
-        ("rational_polynomial", "rational", 8),
-    ],
-)
-def test_wide_lenses_of_a_bag_are_read(tmp_path, told, model, count):
-    r, numbers = ros_of("run.bag"), tuple(np.linspace(0.1, 0.2, count).tolist())
-    told = info(r, model=told, D=numbers)
-    bag = write_bag(tmp_path / "run.bag", {TOPIC: pictures(r), "/camera/camera_info": told})
-    found = open_source(bag).calibration
-    assert (found.model, found.distortion) == (model, numbers)
-
-
 def refused(message, *given, **more):
     with pytest.raises(ValueError, match=message) as caught:
         list(open_source(*given, **more))

@@ -147,28 +147,6 @@ def test_a_picture_of_seven_scenes_may_lack_its_pose(tmp_path):
     np.testing.assert_allclose(reference.times, [3 / 30], rtol=0, atol=1e-12)
 
 
-def test_a_smaller_picture_and_its_calibration_see_a_point_in_the_same_direction(tmp_path):
-    """A bright spot, where the scaled calibration has it."""
-    draw = np.random.default_rng(0)
-    camera = Calibration(320, 240, 300.0, 310.0, 150.0, 125.0)
-    write_calibration(tmp_path / "calibration.json", camera)
-    (tmp_path / "images").mkdir()
-    ray = np.array([0.21, -0.13, 1.0])
-    u, v, _ = camera.matrix @ ray
-    y, x = np.mgrid[:240, :320]
-    image = 200 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 6.0**2)) + draw.uniform(0, 1)
-    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.rint(image).astype(np.uint8))
-    listed("0 0.png")(tmp_path)
-    source = open_source(tmp_path, scale=0.4)
-    (frame,) = source
-    assert frame.image.shape == (96, 128)
-    weight = np.where(frame.image > 20, frame.image, 0).astype(float)
-    y, x = np.mgrid[:96, :128]
-    centre = np.array([np.sum(weight * x), np.sum(weight * y)]) / weight.sum()
-    # Grey levels are whole; pixels counted from the corner would be 0.3 off.
-    np.testing.assert_allclose(centre, (source.calibration.matrix @ ray)[:2], rtol=0, atol=0.05)
-
-
 @pytest.mark.parametrize(
     ("size", "tracked"),
     [((1280, 960), (1280, 960)), ((1080, 2700), (360, 900))],

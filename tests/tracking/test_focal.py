@@ -13,7 +13,6 @@ import cv2
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
-from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.report import Tracked
 
@@ -59,21 +58,6 @@ def test_the_lens_that_fits_is_found(factor, k1):
     off = np.array([np.log(found.focal * factor), found.k1 + k1])
     assert (np.abs(off) < 4 * found.sigma).all()
     assert (found.sigma < [0.02, 0.02]).all()
-
-
-def test_a_fisheye_is_adjusted_as_well():
-    fisheye = replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0), model="fisheye")
-    history, points = video(turn=0.3)
-    draw = np.random.default_rng(5)
-    for result in history:
-        T_wc = result.T_wc
-        X = (points.points - T_wc[:3, 3]) @ T_wc[:3, :3]
-        pixels = sighted(fisheye, X).pixels + draw.normal(0, 0.2, (len(X), 2))
-        result.sights.update(enumerate(pixels))
-    assert better_lens(history, points, fisheye).left > 0.9
-    found = better_lens(history, points, replace(fisheye, distortion=(0.0, 0.0, 0.0, 0.0)))
-    assert found.left < CLEAR
-    assert found.k1 == pytest.approx(0.1, abs=0.03)
 
 
 def test_where_nothing_tells_nothing_is_said():

@@ -69,13 +69,6 @@ def test_ticks_point_where_the_camera_looks():
     np.testing.assert_allclose(starts, turned[::2][:, [0, 2], 3], atol=1e-12)
 
 
-def test_the_reference_is_drawn_as_it_is_given():
-    reference = path_along_x() + 0.0
-    reference[:, 1, 3] = 0.3
-    axis = drawn(path_along_x(), *wall(width=9.0), reference=reference)["from behind"]
-    np.testing.assert_array_equal(line(axis, "reference"), reference[:, [0, 1], 3])
-
-
 @pytest.mark.parametrize(
     ("width", "titles"),
     [(9.0, ["from above", "from behind"]), (1.0, ["from above", "from the side"])],
@@ -155,7 +148,10 @@ def test_titles_labels_and_legend_have_room(length, width):
 def test_loops_join_two_places_and_the_path_without_them_lies_below():
     before = path_along_x(length=1.2)
     ends = np.array([[[0.9, 0.0, 0.0], [0.1, 0.0, 0.0]], [[1.0, 0.0, 0.0], [0.2, 0.0, 0.0]]])
-    axis = drawn(path_along_x(), *wall(), loops=ends, before=before)["from above"]
+    axis = drawn(path_along_x(), *wall(), loops=ends, before=before, reference=before[:7])[
+        "from above"
+    ]
+    assert line(axis, "reference") == pytest.approx(before[:7][:, [2, 0], 3])
     assert line(axis, "a loop closed") == pytest.approx(ends[0][:, [2, 0]])
     assert line(axis, "before loops were closed") == pytest.approx(before[:, [2, 0], 3])
     labels = [one.get_label() for one in axis.lines]

@@ -16,7 +16,6 @@ from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.observations import Prediction
 from jaxslam.tracking.optics import LEAST, on_pinhole, rays, sighted
 from jaxslam.tracking.patches import Patch
-from jaxslam.tracking.places.relocalisation import pose_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import changes_of_view
 
@@ -81,19 +80,6 @@ def test_matches_of_one_motion_agree_by_any_lens(lens):
     np.testing.assert_array_equal(of_one_motion(before, now, lens, 0.45), agree)
     for count in (0, 3, 5):
         assert not of_one_motion(before[:count], now[:count], lens, 0.45).any()
-
-
-@each_lens
-def test_a_pose_is_found_from_points_seen_by_any_lens(lens):
-    before = pixels_of(lens, 60)
-    points = rays(lens, before) * np.random.default_rng(2).uniform(1, 9, (60, 1))
-    X, R = moved(points)
-    found = pose_of(points, sighted(lens, X).pixels, lens)
-    assert found is not None
-    T_wc, which = found
-    np.testing.assert_allclose(T_wc[:3, :3], R, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(T_wc[:3, 3], [0.3, 0.05, 0.2], rtol=0, atol=1e-4)
-    assert len(which) >= 20
 
 
 @each_lens

