@@ -49,6 +49,12 @@ def test_a_landmark_is_judged_by_its_latest_searches(before, in_vain, goes):
     assert failing(landmarks, SETTINGS) == ([3] if goes else [])
 
 
+def test_a_landmark_that_is_found_often_enough_is_kept():
+    least = SETTINGS.least_success
+    landmarks = {3: landmark(0, success=least), 4: landmark(1, success=np.nextafter(least, 0))}
+    assert failing(landmarks, SETTINGS) == [4]
+
+
 def test_a_frame_in_which_nothing_is_found_is_held_against_none():
     landmarks = search(pair(), [False, False], 40)
     assert failing(landmarks, SETTINGS) == []

@@ -210,6 +210,17 @@ def texture(width=640, height=480, seed=4):
 WIDE = np.diag([50.0**2, 50.0**2])  # gate: 152 pixels to each side
 
 
+@pytest.mark.parametrize(("sigma", "found"), [(8.0, False), (18.0, True)])
+def test_a_second_place_that_is_nearly_as_much_alike_is_ambiguous(sigma, found):
+    """Their correlations are .03 and .1 apart."""
+    image, place, (u, v) = texture(), np.array([250.0, 200.0]), (238, 188)
+    template = Patch.take(image, place).warped(np.eye(2))
+    other = image[v:, u:][:25, :25].copy()
+    image[v:, u + 26 :][:25, :25] = add_noise(other, np.random.default_rng(0), sigma)
+    match = match_patch(image, template, place + [13, 0], np.diag([40.0, 1.0]))
+    assert (match is not None) == found
+
+
 def test_an_ellipse_is_cut_at_a_quarter_of_the_width():
     template = Patch.take(texture(), CENTRE + 150).warped(np.eye(2))
     for away, found in ((158, True), (163, False)):
