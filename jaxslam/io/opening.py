@@ -16,7 +16,7 @@ from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
 from jaxslam.io.kitti import KITTI
 from jaxslam.io.lens_files import read_calibration
-from jaxslam.io.recording import PLAIN, TIMESTAMPED, Layout, Recording
+from jaxslam.io.recording import PLAIN, TIMESTAMPED, Recording
 from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
 from jaxslam.io.source import Source, Trajectory, check_size, resized, selected
@@ -77,13 +77,9 @@ def open_recording(path: str | Path, rate: float = 30.0) -> Recording:
     path = Path(path)
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate must be a positive number of frames per second, not {rate}")
-    return _layout_of(path).open(path, rate)
-
-
-def _layout_of(path: Path) -> Layout:
-    layout = next((layout for layout in LAYOUTS if layout.recognises(path)), None)
-    if layout is not None:
-        return layout
+    for layout in LAYOUTS:
+        if layout.recognises(path):
+            return layout.open(path, rate)
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     names = "; ".join(layout.name for layout in LAYOUTS)

@@ -52,9 +52,8 @@ class PoseWithCovariance:
         `T Exp(e) T_s Exp(s) = T T_s Exp(A e) Exp(s)` with `A = Ad(T_s⁻¹)`, so that the covariance
         is `A P Aᵀ + P_s`, to first order, of errors that are independent.
         """
-        A = adjoint(np.linalg.inv(step.T_wc))
-        carried = A @ self.covariance @ A.T
-        covariance = (carried + carried.T) / 2 + step.covariance
+        P = carried(self.covariance, np.linalg.inv(step.T_wc))
+        covariance = (P + P.T) / 2 + step.covariance
         return PoseWithCovariance(self.T_wc @ step.T_wc, covariance)
 
     def scaled(self, scale: float) -> PoseWithCovariance:
@@ -79,6 +78,12 @@ def adjoint(T: Transform) -> Float[np.ndarray, "6 6"]:
     """`Ad(T)`, with `T Exp(e) = Exp(Ad(T) e) T`: `[[R, [t]× R], [0, R]]`, position first."""
     R = T[:3, :3]
     return np.block([[R, _cross(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])
+
+
+def carried(P: Float[np.ndarray, "6 6"], T: Transform) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of a camera from which the one of this covariance is at T."""
+    A = adjoint(T)
+    return A @ P @ A.T
 
 
 def positive(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

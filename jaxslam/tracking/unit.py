@@ -19,7 +19,7 @@ from jaxslam.tracking.pose_with_covariance import (
     Positions,
     Spreads,
     Transform,
-    adjoint,
+    carried,
     positive,
 )
 
@@ -134,9 +134,9 @@ class MapInWorld:
         Of what it did not know when a loop closed, that is left which was not known then.
         """
         T_now, T_told = here.T_wc, self.told.T_wc
-        A = adjoint(np.linalg.inv(T_now) @ T_told)
-        since = positive(here.covariance - A @ self.told.covariance @ A.T)
-        covariance = since + A @ self.known.covariance @ A.T
+        T = np.linalg.inv(T_now) @ T_told
+        since = positive(here.covariance - carried(self.told.covariance, T))
+        covariance = since + carried(self.known.covariance, T)
         camera = self.origin.then(PoseWithCovariance(self._moved @ T_now, covariance))
         return replace(self, here=here, camera=camera)
 

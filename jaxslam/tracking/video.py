@@ -8,8 +8,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from jaxslam._runtime.files import write_json, write_text
 from jaxslam.evaluation import write_covariances
 from jaxslam.filters.protocol import AbstractStaged
@@ -181,19 +179,6 @@ def _write(
             summary["ate_causal"] = error
     write_json(out / "summary.json", summary, allow_nan=False)
     known = known_points(points, history)
-    unit = "m" if summary["unit"] == "m" else "map units"
-    _draw_map(known, history, before, reference_in_map(source, history), unit, out)
-    return summary
-
-
-def _draw_map(
-    known: Points,
-    history: list[Tracked],
-    before: list[Tracked],
-    reference: np.ndarray | None,
-    unit: str,
-    out: Path,
-) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
     ends = {r.submap: r.T_wc[:3, 3] for r in history}
     loops = [(r.T_wc[:3, 3], ends[r.loop]) for r in history if r.loop in ends]
@@ -202,12 +187,13 @@ def _draw_map(
         trajectory_of(history).T_wc,
         known.points,
         known.in_map,
-        reference=reference,
+        reference=reference_in_map(source, history),
         path=out / "map.png",
-        unit=unit,
+        unit="m" if tracker.unit == "m" else "map units",
         lost=[result.lost for result in history],
         begun=begun,
         begun_covariances=[history[place].camera.position_covariance for place in begun],
         loops=loops,
         before=trajectory_of(before).T_wc[: len(before) if loops else 0],
     )
+    return summary

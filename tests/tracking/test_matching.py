@@ -217,7 +217,7 @@ def test_a_second_place_that_is_nearly_as_much_alike_is_ambiguous(sigma, found):
     template = Patch.take(image, place).warped(np.eye(2))
     other = image[v:, u:][:25, :25].copy()
     image[v:, u + 26 :][:25, :25] = add_noise(other, np.random.default_rng(0), sigma)
-    match = match_patch(image, template, place + [13, 0], np.diag([40.0, 1.0]))
+    match = match_patch(image, template, place + np.array([13, 0]), np.diag([40.0, 1.0]))
     assert (match is not None) == found
 
 

@@ -26,7 +26,7 @@ from jaxslam.tracking.pose_with_covariance import (
     Places,
     PoseWithCovariance,
     Transform,
-    adjoint,
+    carried,
     positive,
 )
 from jaxslam.tracking.report import Tracked
@@ -110,8 +110,7 @@ def _joined_frame(
     ratio = float(np.exp(join.log_ratio))
     T = np.linalg.inv(there.T_wc) @ frame.T_wc
     way = PoseWithCovariance(T).scaled(ratio)
-    A = adjoint(np.linalg.inv(T))
-    since = frame.covariance - A @ there.covariance @ A.T
+    since = frame.covariance - carried(there.covariance, np.linalg.inv(T))
     between = PoseWithCovariance(T, positive(-since if before else since)).scaled(ratio)
     along = np.concatenate([T[:3, :3].T @ way.T_wc[:3, 3], np.zeros(3)])
     P = between.covariance + join.sigma**2 * np.outer(along, along)

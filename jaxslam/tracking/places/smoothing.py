@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, carried
 from jaxslam.tracking.report import Tracked
 
 
@@ -70,17 +69,10 @@ class _Part:
         bent = np.linalg.inv(self.begins.T_wc) @ self.ends.T_wc @ np.linalg.inv(self.way.T_wc)
         T = self.begins.T_wc @ _part_of(bent, share) @ T_here
         first, last = (
-            _carried(end.covariance, np.linalg.inv(T) @ end.T_wc)
-            for end in (self.begins, self.ends)
+            carried(end.covariance, np.linalg.inv(T) @ end.T_wc) for end in (self.begins, self.ends)
         )
         between = (1 if elsewhere else share) * (1 - share) * self.way.covariance
         return PoseWithCovariance(T, (1 - share) * first + share * last + between)
-
-
-def _carried(P: Float[np.ndarray, "6 6"], T: Transform) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of a camera from which the one of this covariance is at T."""
-    A = adjoint(T)
-    return A @ P @ A.T
 
 
 def _part_of(T: Transform, share: float) -> Transform:
