@@ -246,6 +246,18 @@ def test_a_sum_ends_where_one_gaussian_costs_little(monkeypatch, share):
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_sum_that_has_ended_begins_again_where_one_gaussian_costs_much(monkeypatch, share):
+    """Not as soon as it costs what it ended at."""
+    state = some_sum()
+    one = SumState(state.members, jnp.where(jnp.arange(9) == 4, 0.0, -jnp.inf))
+    monkeypatch.setattr(split_merge, "ENOUGH", 0.0)
+    monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_as_one(one)))
+    after = split(3)(one)
+    assert (after.alive.sum() > 1) == (share < 1)
+    assert_same_moments(after, one)
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
 def test_late_splits_are_across_the_displacement(monkeypatch, share):
     """What is along it stays as uncertain in every member as it was."""
     state = some_sum()

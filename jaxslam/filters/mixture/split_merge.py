@@ -13,7 +13,7 @@ member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of th
 Splits and mergers keep the sum's mean and covariance. Members that differ along t differ in scale,
 of which the amplitude of innovations says something, wrongly where the prior on depth is wrong: so
 once the cost is small they are split across t alone (`ACROSS`). As soon as one linearisation
-serves, the sum ends in one Gaussian (`ENOUGH`), which costs the time of one.
+serves, the sum ends in one Gaussian (`ENOUGH`), and is one until it costs more than `ACROSS` again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.conditional import at_places, map_or_zero
+from jaxslam._numerics.conditional import at_places, cond, map_or_zero
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.blocks import minus, plus
 from jaxslam.filters.linear.covariance import landmark_moments
@@ -48,8 +48,8 @@ FEW = 7
 the same time."""
 ACROSS, ENOUGH = 1e-2, 1e-4
 """Costs of a sum as one Gaussian, σ² of a pixel for all landmarks together. Below the first, splits
-are across the displacement alone; below the second the sum ends: pairs are merged whatever it
-costs, and no member is split."""
+are across the displacement alone, and no member that is the only one is split; below the second
+the sum ends: pairs are merged whatever it costs, and no member is split."""
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
@@ -135,7 +135,14 @@ def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     """So many times, each of other members: the one of the greatest cost split, and two of the
     others merged, if that is a gain; else two merged, if that costs nothing."""
     parts, one_serves = _as_late(parts)
-    places, due, divided = _planned(parts, rounds, one_serves)
+    ended = one_serves & (jnp.sum(parts.sum.alive) == 1)
+    no = jnp.zeros(rounds, bool)
+    places, due, divided = cond(
+        ~ended,
+        lambda _, *told: _planned(*told, rounds),
+        (jnp.zeros((rounds, 3), int), no, no),
+        *(parts.sum.log_weights, parts.values, parts.covariances, one_serves),
+    )
     split = jnp.any(divided & (places[:, 2] == jnp.arange(parts.sum.alive.size)[:, None]), axis=1)
     return at_places(_replaced, parts.sum, (parts.by_core, split), places, due, None)
 
@@ -144,6 +151,7 @@ def _as_late(parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
     """What a split may reach: near the end only what is across the values, the displacement; and
     whether one Gaussian serves."""
     cost = jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
+    alone = jnp.sum(parts.sum.alive) == 1
 
     def across(value, by_core, P):
         squared = value @ value
@@ -151,11 +159,15 @@ def _as_late(parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
         left = jnp.eye(value.size, dtype=value.dtype) - share * jnp.outer(value, value)
         return value, left @ by_core, left @ P @ left
 
-    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost < ENOUGH
+    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost < jnp.where(alone, ACROSS, ENOUGH)
 
 
 def _planned(
-    parts: _Parts, rounds: int, one_serves: Bool[Array, ""]
+    log_weights: Float[Array, " k"],
+    values: Float[Array, "k n"],
+    covariances: Float[Array, "k n n"],
+    one_serves: Bool[Array, ""],
+    rounds: int,
 ) -> tuple[Int[Array, "w 3"], Bool[Array, " w"], Bool[Array, " w"]]:
     """The places of two that are merged and of one that is split, so many times; whether that is
     due, and whether the split is. Where one Gaussian serves, pairs are merged alone.
@@ -164,13 +176,13 @@ def _planned(
     lessens it by `w δ² λ` with the greatest eigenvalue λ; a merger adds
     `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`, and nothing with a member without weight, whose place it frees.
     """
-    weights, alive = jnp.exp(parts.sum.log_weights), parts.sum.alive
-    variances = jax.vmap(lambda P: eigh(P)[0][-1])(parts.covariances)
+    weights, alive = jnp.exp(log_weights), jnp.isfinite(log_weights)
+    variances = jax.vmap(lambda P: eigh(P)[0][-1])(covariances)
     gains = jnp.where(alive, weights * SPLIT**2 * variances, 0.0)
 
     tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
     shared = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
-    apart = jnp.sum((parts.values[:, None] - parts.values) ** 2, axis=-1)
+    apart = jnp.sum((values[:, None] - values) ** 2, axis=-1)
     loss = jnp.where(shared > 0, shared * apart, 0.0)
     loss = jnp.where(index[:, None] < index, loss, jnp.inf)
     both = alive[:, None] & alive
