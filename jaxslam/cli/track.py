@@ -193,7 +193,7 @@ class TrackOptions:
                 "--imu-calibration imu.yaml camchain-imucam.yaml (docs/own-video.md)"
             )
         log, calibration = read_inertial(readings), read_inertial_calibration(*files)
-        for note in log.notes:
+        for note in (*log.notes, *calibration.compared(log)):
             warnings.warn(note, stacklevel=2)
         return Inertial.of(log, calibration, source.times)
 

@@ -10,11 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.imu import inertial_files
+from jaxslam.io.imu import InertialLog, inertial_files
 from jaxslam.io.lens_files import numbers_of, yaml_keys
 from jaxslam.io.text import text_lines
 from jaxslam.io.tum import not_rigid
 
+_APART = 5.0
+"""Times that a density and the scatter of readings may differ by."""
 _DENSITIES = {
     "gyroscope_noise_density": ("rad/s/√Hz", 0.1),
     "gyroscope_random_walk": ("rad/s²/√Hz", 0.1),
@@ -46,6 +48,28 @@ class InertialCalibration(NamedTuple):
     clock_offset: float = 0.0
     """Seconds by which the clock of the IMU is ahead of the camera's, `t_imu = t_cam + offset`, as
     Kalibr's `timeshift_cam_imu`."""
+
+    def compared(self, log: InertialLog) -> tuple[str, ...]:
+        """A sentence for each density of white noise that is five times more, or less, than that of
+        a log at its calmest; of a standard deviation per reading among others.
+
+        Of white noise of density n, readings δ s apart differ by σ = n √(2/δ) from one to the next;
+        that of the calmest tenth of its seconds is taken, in which there is the least motion.
+        """
+        notes, step = [], float(np.median(np.diff(log.times)))
+        for sensor in ("gyroscope", "accelerometer"):
+            squares = (np.diff(getattr(log, sensor), axis=0) ** 2).mean(axis=1)
+            count = min(max(round(1 / step), 1), len(squares))
+            of_seconds = squares[: len(squares) // count * count].reshape(-1, count).mean(axis=1)
+            seen = np.sqrt(np.quantile(of_seconds, 0.1) * step / 2)
+            what, stated = f"{sensor}_noise_density", getattr(self, f"{sensor}_noise_density")
+            why = f"if it is the σ of a reading, divide it by √rate, {step**-0.5:.3g}"
+            if stated < seen:
+                why = "from vibration or a worse sensor: a filter trusts it too much"
+            if not seen / _APART <= stated <= seen * _APART:
+                told = f"{what} is {stated:.3g}, but the calmest readings of {log.name} scatter"
+                notes.append(f"{told} as of {seen:.3g}; {why}")
+        return tuple(notes)
 
 
 def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:

@@ -1,11 +1,13 @@
 """Calibrations of an IMU in the files of every program are the same; what is wrong is named."""
 
+import re
+
 import numpy as np
 import pytest
 from videos import SENSOR, pose, words
 
 from jaxslam.io import read_inertial_calibration
-from jaxslam.io.imu import inertial_files
+from jaxslam.io.imu import InertialLog, inertial_files
 
 T_CI = pose(3)
 DENSITIES = """accelerometer_noise_density: 2.0e-3  # [ m / s^2 / sqrt(Hz) ] ( "white noise" )
@@ -128,3 +130,28 @@ def test_scale_factors_that_are_not_applied_are_named(tmp_path):
         UserWarning, match="imu_chain.yaml, .*: Ta of the IMU are not applied to its"
     ):
         read_inertial_calibration(*paths(np.diag([1.0, 1.01, 1.0])))
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (1.0, None),
+        (200**0.5, r"scatter as of \S+; if it is the σ of a reading, divide it by √rate, 14\.1"),
+        (0.1, "from vibration or a worse sensor: a filter trusts it too much"),
+    ],
+)
+def test_densities_are_compared_with_a_log_at_its_calmest(factor, told, tmp_path):
+    found = read_inertial_calibration(*write(tmp_path, FILES["Kalibr"]))
+    draw, times = np.random.default_rng(1), 0.005 * np.arange(4000)
+    moved = 0.3 * np.maximum(times[:, None] - 10, 0) * draw.normal(size=(4000, 3))  # after 10 s
+    rates = moved + found.gyroscope_noise_density * 200**0.5 * draw.normal(size=(4000, 3))
+    forces = moved + found.accelerometer_noise_density * 200**0.5 * draw.normal(size=(4000, 3))
+    log = InertialLog(times, rates, forces, "mine")
+    stated = found._replace(gyroscope_noise_density=factor * found.gyroscope_noise_density)
+    notes = stated.compared(log)
+    assert len(notes) == (told is not None)
+    for note in notes:
+        assert note.startswith("gyroscope_noise_density is ")
+        seen = float(note.split("scatter as of ")[1].split(";")[0])
+        assert seen == pytest.approx(1.6968e-4, rel=0.1)
+        assert re.search(told, note)
