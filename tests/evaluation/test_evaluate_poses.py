@@ -161,6 +161,32 @@ def test_the_checker_asks_for_differences_beyond_scatter_and_of_some_size():
     assert found(a, a=nees, c=noisy).consistent == (a, c)
 
 
+def along_one_path(runs, factor, geometry, seed):
+    """Runs of one path, some metres from the origin, each with one left error all along it."""
+    T, n = some(geometry, (1, 12), seed) + 0.0, geometry.point_dim
+    T[..., :n, n] += 9.0
+    T, sigma = np.repeat(T, runs, axis=0), np.repeat([0.07, 0.02], [n, geometry.tangent_dim - n])
+    errors = factor * sigma * np.random.default_rng(seed).normal(size=(runs, 1, len(sigma)))
+    P = np.broadcast_to(np.diag(sigma**2), (runs, 12, len(sigma), len(sigma)))
+    truth = benchmark.displaced(T, np.repeat(errors, 12, axis=1), Convention("left"))
+    return T, P, truth
+
+
+@pytest.mark.parametrize(
+    ("runs", "factor", "geometry"),
+    [(16, 1, PLANAR), (8, 1, PLANAR), (6, 1, SPATIAL), (16, 4, PLANAR)],
+)
+def test_of_few_runs_along_one_path_the_convention_is_found(runs, factor, geometry):
+    """Their wrong NEES scatters as the square of one number a run, and is far larger all the same;
+    also where runs are fewer, or σ is wrong with every convention."""
+    for seed in (1, 2, 4) if runs < 16 else (0, 1):
+        case = along_one_path(runs, factor, geometry, seed)
+        for stated, wrong in ((Convention("right"), True), (Convention("left"), False)):
+            found = jaxslam.evaluate_poses(*case, stated).identified
+            assert found, seed
+            assert (found.doubtful or found.better is not None) == wrong, seed
+
+
 def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
     T, P, truth = logged(Convention("split", "body"))
     truth = truth.copy()
