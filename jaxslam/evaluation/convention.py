@@ -20,7 +20,7 @@ All matrices that change one into another have determinant one: a wrong conventi
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -37,9 +37,9 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, in_seconds
+from jaxslam.io.logs.log import MIXED, Log, in_seconds
 from jaxslam.io.logs.unnamed import is_deviations, without_values
-from jaxslam.io.text import read_table
+from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import write_table
 
 Joints = Float[np.ndarray, "runs k k"]
@@ -301,7 +301,6 @@ def _truth_derivatives(
 
 ANGLES = {"rad": 1.0, "deg": np.pi / 180, "half": 2.0}
 """Units of angles, in radians: `half` is the vector part of a quaternion, as in g2o."""
-_WORDS = (*CHOICES, "angle", "length")
 ROUNDED = 1e-6
 """The least eigenvalue, of the greatest number, of a covariance that was rounded."""
 _ROWS, _COLUMNS = np.triu_indices(6)
@@ -350,11 +349,12 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     `ValueError`, naming the file, for a line of other numbers, or that are not finite, and for a
     word of the header that is not known.
     """
-    return covariances_of_file(path, t)[0]
+    found = covariances_of_file(path, t)
+    return CovarianceText(found.times, found.covariances, dict(found.said))
 
 
-def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, tuple[str, ...]]:
-    """The same, and remarks on what was made of the file."""
+def covariances_of_file(path: str | Path, t: int = 6) -> Log:
+    """The same, as a log without poses."""
     triangle = t * (t + 1) // 2
     kinds = {
         1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
@@ -364,8 +364,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     table = read_table(path, "covariances", "covariances", kinds[1 + triangle])
     count, of_names, rows = table.rows.shape[1], named.read(table), table.rows
     if of_names is not None and len(of_names.covariances):
-        told = CovarianceText(of_names.times, of_names.covariances, dict(of_names.said))
-        return told, of_names.notes
+        return of_names
     deviations = t == 6 and is_deviations(rows)
     expected = kinds.get(count, kinds[1 + triangle])
     if deviations:
@@ -374,10 +373,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1))
     if wrong.size or not (deviations or count in kinds):
         raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
-    try:
-        said = {**(MIXED if deviations else {}), **_said(" ".join(table.comments))}
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    said, unit = _said(table, MIXED if deviations else {})
     P = np.full((len(rows), t, t), np.nan)
     times, notes = in_seconds(table, rows[:, 0])
     if deviations or count == 1 + t:
@@ -388,10 +384,9 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     else:
         P[there], more = _of_triangle(path, rows[there, 1:], t)
         notes += more
-    unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
     names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
-    return CovarianceText(times, scale[:, None] * P * scale, said), notes
+    return Log(times, np.empty((0, 4, 4)), scale[:, None] * P * scale, said, notes)
 
 
 def _of_triangle(
@@ -427,15 +422,20 @@ def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndar
     return sigma**2
 
 
-def _said(comments: str) -> dict[str, str]:
-    """The words `key=value` of a header. Raises ValueError for misspelt keys and unknown values."""
-    said = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", comments))
-    for key in said:
-        if meant := suggestion(key, _WORDS) if key not in _WORDS else "":
-            raise ValueError(
-                f"unknown key {key!r} in the header{meant}; known: {', '.join(_WORDS)}"
-            )
-    known = {**CHOICES, "angle": tuple(ANGLES)}
-    for key in known.keys() & said.keys():
-        lookup(key, [said[key]], dict.fromkeys(known[key]))
-    return {key: value for key, value in said.items() if key in _WORDS}
+def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], float]:
+    """The words of a convention in a header, and its unit of angles, in radians. Raises ValueError
+    for misspelt keys and unknown values."""
+    told = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", " ".join(table.comments)))
+    known = {**CHOICES, "angle": tuple(ANGLES), "length": ()}
+    try:
+        for key in told:
+            if meant := suggestion(key, known) if key not in known else "":
+                raise ValueError(
+                    f"unknown key {key!r} in the header{meant}; known: {', '.join(known)}"
+                )
+            if known.get(key):
+                lookup(key, [told[key]], dict.fromkeys(known[key]))
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}") from None
+    said = {key: value for key, value in told.items() if key in CHOICES}
+    return {**default, **said}, ANGLES[told.get("angle", "rad")]
