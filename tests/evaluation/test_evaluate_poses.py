@@ -268,7 +268,7 @@ def test_an_axis_of_small_errors_is_estimated_where_it_is_correlated(correlation
     T, P = T.copy(), P.copy()
     T[..., 2, 3] += 1e-6 * np.random.default_rng(1).normal(size=T.shape[:2])
     P[..., 0, 2] = P[..., 2, 0] = correlation * np.sqrt(P[..., 0, 0] * P[..., 2, 2])
-    used, notes = estimated(checked_poses(T, P, truth), SPLIT, "none")
+    used, notes = estimated(checked_poses(T, P, truth, SPLIT), "none")
     assert ("z" not in used) == left_out
     assert notes
 
@@ -717,8 +717,8 @@ def test_the_noise_of_a_first_true_pose_moves_all_and_metres_are_the_truths():
 def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     T, P, truth = logged(Convention(), runs=2, steps=3)
     joint = np.stack([diagonal(one) for one in P])
-    poses, firsts, ones = checked_poses(T, joint, truth), truth[:, 0], np.ones(2)
-    found = with_truth(poses, Convention(), (0.1, 2.0), ones, firsts)
+    poses, firsts = checked_poses(T, joint, truth, Convention()), truth[:, 0]
+    found = with_truth(poses, (0.1, 2.0), np.ones(2), firsts)
     assert found.joint is not None
     blocks = found.joint.reshape(2, 3, 6, 3, 6)
     for k in range(3):
