@@ -368,7 +368,7 @@ def _runs(poses: Poses) -> Iterator[Poses]:
         if poses.joint is not None:
             rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
             joint = poses.joint[run][np.ix_(rows, rows)]
-        yield Poses(*(x[run, own] for x in poses[:4]), poses.convention, joint)
+        yield poses.at((run, own), joint)
 
 
 def _small_at_first(poses: Poses, align: str) -> bool:

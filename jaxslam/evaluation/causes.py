@@ -142,8 +142,10 @@ def _w_first(case: _Case) -> Mistake | None:
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
         return None
-    for name, which in (("estimate", "estimates"), ("truth", "truths")):
-        changed = poses._replace(**{which: _reread(getattr(poses, which), there)})
+    for name, changed in (
+        ("estimate", poses._replace(estimates=_reread(poses.estimates, there))),
+        ("truth", poses._replace(truths=_reread(poses.truths, there))),
+    ):
         if off(changed.estimates, changed.truths) < before / 4:
             fixed = case.again(changed)
             return Mistake(

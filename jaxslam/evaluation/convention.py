@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
-from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
+from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
 from jaxslam.io.logs.log import MIXED, Log, in_seconds
 from jaxslam.io.logs.unnamed import is_deviations, without_values
@@ -143,7 +143,7 @@ def pose_errors(
     T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
     result = np.empty((len(T), geometry_of(T).tangent_dim))
     for part in blocks(len(T)):
-        error = _in_float64(_errors, convention.error, T[part], true[part])
+        error = _in_float64(_error, convention.error, T[part], true[part])
         result[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), error)
     return result.reshape(*estimates.shape[:-2], -1)
 
@@ -250,7 +250,7 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
 def _in_float64(
     function: Callable[..., Result], error: str, *arrays: Float[np.ndarray, "*batch _ _"]
 ) -> Result:
-    """Apply a function of poses to all of them, as NumPy's arrays.
+    """Apply a function of single poses to all of them, as NumPy's arrays.
 
     Their number is filled up to a power of two, so that few programs serve logs of all sizes.
     """
@@ -259,7 +259,7 @@ def _in_float64(
     more = (1 << (count - 1).bit_length()) - count
     filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
     with jax.enable_x64(True):
-        result = jax.device_get(function(error, geometry_of(arrays[0]), *filled))
+        result = jax.device_get(_of_each(function, error, geometry_of(arrays[0]), *filled))
     return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
 
 
@@ -273,30 +273,19 @@ def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
     return jnp.concatenate([truth.translation() - estimate.translation(), turn])
 
 
-@eqx.filter_jit
-def _errors(error: str, geometry: Geometry, estimates: Array, truths: Array) -> Array:
-    of = geometry.group.from_matrix
-    return jax.vmap(lambda T, true: _error(error, of(T), of(true)))(estimates, truths)
-
-
-@eqx.filter_jit
 def _truth_derivatives(
-    error: str, geometry: Geometry, estimates: Array, truths: Array, firsts: Array
-) -> tuple[Array, Array]:
-    of, zero = geometry.group.from_matrix, jnp.zeros(geometry.tangent_dim, estimates.dtype)
+    error: str, estimate: Pose, truth: Pose, first: Pose
+) -> tuple[Float[Array, "t t"], Float[Array, "t t"]]:
+    by_truth = jacobian(lambda T: _error(error, estimate, T), truth)
+    return by_truth, jacobian(lambda F: _error(error, F @ first.inverse() @ estimate, truth), first)
 
-    def one(estimate, truth, first):
-        T, true, F = of(estimate), of(truth), of(first)
 
-        def by_truth(eta):
-            return _error(error, T, true @ exp(geometry.group, eta))
-
-        def by_first(eta):
-            return _error(error, F @ exp(geometry.group, eta) @ F.inverse() @ T, true)
-
-        return jax.jacfwd(by_truth)(zero), jax.jacfwd(by_first)(zero)
-
-    return jax.vmap(one)(estimates, truths, firsts)
+@eqx.filter_jit
+def _of_each(
+    function: Callable[..., Result], error: str, geometry: Geometry, *matrices: Matrices | Array
+) -> Result:
+    of = geometry.group.from_matrix
+    return jax.vmap(lambda *T: function(error, *map(of, T)))(*matrices)
 
 
 ANGLES = {"rad": 1.0, "deg": np.pi / 180, "half": 2.0}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -341,7 +341,13 @@ class Poses(NamedTuple):
             return self
         first = np.argmax(self.logged, axis=1)
         steps = np.union1d(np.arange(0, self.logged.shape[1], every), first)
-        return Poses(*(x[:, steps] for x in self[:4]), self.convention)
+        return self.at((slice(None), steps))
+
+    def at(self, places: tuple[Any, ...], joint: np.ndarray | None = None) -> Poses:
+        """Those at some places, and their joint covariance."""
+        arrays = self.estimates, self.covariances, self.truths, self.logged
+        T, P, truths, logged = (x[places] for x in arrays)
+        return Poses(T, P, truths, logged, self.convention, joint)
 
 
 def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
