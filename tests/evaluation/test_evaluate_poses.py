@@ -185,6 +185,10 @@ def test_of_few_runs_along_one_path_the_convention_is_found(runs, factor, geomet
             found = jaxslam.evaluate_poses(*case, stated).identified
             assert found, seed
             assert (found.doubtful or found.better is not None) == wrong, seed
+            told = "doubtful" if factor == 1 else "fits better than"
+            assert (told in found.sentence) == wrong
+    T, P, truth = along_one_path(2, 0.0, geometry, 0)  # without errors nothing is told
+    assert not jaxslam.evaluate_poses(T, P, truth, Convention("left")).suggested
 
 
 def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
