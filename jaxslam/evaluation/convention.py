@@ -180,7 +180,7 @@ def converted(
     new: Convention,
 ) -> Float[np.ndarray, "*batch t t"]:
     """Convert covariances of poses from one convention to another."""
-    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64)
+    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
     transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
     return P
 

@@ -160,7 +160,7 @@ def _compared(poses: Poses, asked: Comparison) -> _Compared:
         quantity="NEES",
         times=step_times(None, poses.estimates.shape[1])[start:],
         timed=False,
-        names=used,
+        names=tuple(names[i] for i in axes),
         convention=convention,
         alignment=align,
         notes=notes,
@@ -205,9 +205,8 @@ def _identified(poses: Poses, asked: Comparison) -> Identification:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                names = tuple(name for name in convention.names(geometry) if name in asked.used)
                 other = poses._replace(convention=convention)
-                one = _tried(_compared(other, asked._replace(used=names)))
+                one = _tried(_compared(other, asked))
                 volume = one.log_determinant - _log_volume(other)
                 result[convention] = one._replace(log_determinant=volume)
         return result
