@@ -4,8 +4,8 @@ A wrong convention keeps the determinant of a covariance, so that it raises the 
 the one with the least NEES is the most likely, whatever the filter's σ is wrong by. (Of a part of
 the axes the determinant may change: `NEES det(P)^(1/dof)` is compared.) It is distinguished from
 another where the runs' averages of NEES differ by more than they scatter, pair by pair, or where
-the runs are far likelier with it; and it *makes the data consistent* where nothing is proven
-against the NEES of all axes, nor of position or rotation alone.
+few runs are far likelier with it. It *makes the data consistent* where nothing is proven against
+the NEES of all axes, nor of position or rotation alone.
 
 A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
 position at least from n to n − 1. Only where it lowers it further, so that no σ explains it, is

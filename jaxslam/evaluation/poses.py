@@ -54,7 +54,7 @@ BEYOND = (
 )
 
 
-class Comparison(NamedTuple):
+class PoseComparison(NamedTuple):
     """How poses are compared with the truth."""
 
     align: str = "none"
@@ -107,12 +107,12 @@ def evaluate_poses(
     lookup("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths, stated)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
-    found = as_stated(poses, Comparison(align, axes_named(axes_used, poses), sigma))
-    identified = _identified(poses, Comparison(align, found.names, sigma))
+    found = as_stated(poses, PoseComparison(align, axes_named(axes_used, poses), sigma))
+    identified = _identified(poses, PoseComparison(align, found.names, sigma))
     at = at[len(at) - found.steps :]
 
     def compared(poses: Poses, align: str, axes: Sequence[str]) -> Evaluation:
-        return as_stated(poses, Comparison(align, tuple(axes) or found.names, sigma))
+        return as_stated(poses, PoseComparison(align, tuple(axes) or found.names, sigma))
 
     told = tuple(causes(poses, align, found, compared))
     if not told and identified.doubtful and not identified.stands:
@@ -123,14 +123,14 @@ def evaluate_poses(
     return described(found, causes=told, **how)
 
 
-def as_stated(poses: Poses, asked: Comparison) -> Evaluation:
+def as_stated(poses: Poses, asked: PoseComparison) -> Evaluation:
     """The verdict in the convention that is stated, without a look at others."""
     used, told = (asked.used, ()) if asked.used else estimated(poses, asked.align)
     found = _compared(poses, asked._replace(used=used)).found
     return described(found, notes=(*told, *found.notes))
 
 
-def _compared(poses: Poses, asked: Comparison) -> _Compared:
+def _compared(poses: Poses, asked: PoseComparison) -> _Compared:
     """The errors and covariances along the axes used, aligned, at one scale where it is free."""
     (align, used, truth_sigma), convention = asked, poses.convention
     names = convention.names(geometry_of(poses.estimates))
@@ -197,7 +197,7 @@ def _with_truth(
     return with_truth(later, truth_sigma, np.exp(log_scale), firsts)
 
 
-def _identified(poses: Poses, asked: Comparison) -> Identification:
+def _identified(poses: Poses, asked: PoseComparison) -> Identification:
     """Identify the convention among those of the same scale; else among those given the scale."""
     geometry, poses, stated = geometry_of(poses.estimates), poses.some(), poses.convention
 

@@ -325,7 +325,7 @@ class Evaluation:
         return str(self)
 
     def _repr_html_(self) -> str:
-        return _html(self, self._told())
+        return _html(self, _told(self))
 
     def __getattr__(self, name: str) -> NoReturn:
         meant = suggestion(name, dir(type(self)))
@@ -334,24 +334,7 @@ class Evaluation:
     def __str__(self) -> str:
         table = _in_columns(*_rows(self)) if self.names else []
         counted = [_counted(self), _covered(self)]
-        return "\n".join([self._told(), "", *counted, *table, *self.remarks])
-
-    def _told(self) -> str:
-        """The verdict in lines, or the mistakes of the log in its place."""
-        # Lost runs are named below, by their names here.
-        more = sentences(self._of_nees | {"lost_runs": None}, self.quantity)[1:]
-        told = [self.headline, *more]
-        if self.scale is not None and not self.scale.disproved:
-            told.append(self.scale.sentence)
-        told += _beyond_nees(self)
-        doubt = [] if self.identified is None else [self.identified.sentence]
-        if self.lost_runs:
-            more = len(self.lost_runs) - _LISTED
-            which = ", ".join(self.lost_runs[:_LISTED]) + (f" and {more} more" if more > 0 else "")
-            told.append(f"{'lost' if self.quantity == 'NEES' else 'outlying'}: {which}")
-        if self.mistakes:
-            told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
-        return "\n".join([*told, *doubt])
+        return "\n".join([_told(self), "", *counted, *table, *self.remarks])
 
     @property
     def remarks(self) -> list[str]:
@@ -362,6 +345,26 @@ class Evaluation:
     def expected(self) -> str:
         """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
+
+
+def _told(evaluation: Evaluation) -> str:
+    """The verdict in lines, or the mistakes of the log in its place."""
+    # Lost runs are named below, by their names here.
+    more = sentences(evaluation._of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
+    told = [evaluation.headline, *more]
+    if evaluation.scale is not None and not evaluation.scale.disproved:
+        told.append(evaluation.scale.sentence)
+    told += _beyond_nees(evaluation)
+    doubt = [] if evaluation.identified is None else [evaluation.identified.sentence]
+    if evaluation.lost_runs:
+        more = len(evaluation.lost_runs) - _LISTED
+        which = ", ".join(evaluation.lost_runs[:_LISTED]) + (
+            f" and {more} more" if more > 0 else ""
+        )
+        told.append(f"{'lost' if evaluation.quantity == 'NEES' else 'outlying'}: {which}")
+    if evaluation.mistakes:
+        told, doubt = [evaluation.headline, *(mistake.told for mistake in evaluation.mistakes)], []
+    return "\n".join([*told, *doubt])
 
 
 def described(found: Evaluation, **words: Any) -> Evaluation:
@@ -424,7 +427,7 @@ def latex(evaluation: Evaluation) -> str:
         for symbol, name in symbols.items():
             line = line.replace(symbol, name)
         lines += [line + r" \\", r"\midrule"] if row is first else [line + r" \\"]
-    comments = [f"% {line}" for line in (*evaluation._told().splitlines(), _counted(evaluation))]
+    comments = [f"% {line}" for line in (*_told(evaluation).splitlines(), _counted(evaluation))]
     return "\n".join([*comments, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
