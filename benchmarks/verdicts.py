@@ -29,7 +29,7 @@ from jaxslam._numerics.arrays import AnyArray
 from jaxslam.evaluation import evaluate
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.inputs import checked_poses
-from jaxslam.evaluation.poses import as_stated, evaluate_poses
+from jaxslam.evaluation.poses import PoseComparison, as_stated, evaluate_poses
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, exp
 from jaxslam.statistics import PowerSums, Tally, not_disproved
 from jaxslam.statistics.verdict import THIRDS
@@ -531,8 +531,8 @@ def _circle(runs: int, steps: int) -> np.ndarray:
 
 def judged_drift(kind: str, drift: float, options: ScaleDrift, seed: int) -> tuple[str, bool]:
     """The word on a set, and whether the drift was named."""
-    poses = checked_poses(*drifting(kind, drift, options, seed))
-    found = as_stated(poses, SPLIT, "sim3")
+    poses = checked_poses(*drifting(kind, drift, options, seed), SPLIT)
+    found = as_stated(poses, PoseComparison("sim3"))
     if found.scale is None:
         raise RuntimeError("a Sim(3) has a scale")
     return found.verdict["word"], found.scale.disproved

@@ -522,17 +522,14 @@ LOGS = {
     "TUM": Log(tum),
     "TUM, of the tracker": Log(lambda x: tum(x, "trajectory.txt", truth="groundtruth.txt")),
     "TUM, named by options": Log(
-        lambda x: tum(x, "mine.tum", "sigma.txt", "mocap.csv"),
-        source="mine.tum",
+        lambda x: tum(x, "mine.csv", "sigma.txt", "mocap.csv"),
+        source="mine.csv",
         beside={"covariance": "sigma.txt", "truth": "mocap.csv"},
     ),
     "TUM, all of a covariance": Log(tum_and(P)),
     "TUM, σ": Log(tum_and(SIGMA), OF_SIGMAS),
     **{f"states of OpenVINS, {n} cameras": Log(states(n), OF_SIGMAS) for n in (1, 2)},
     "poses of OpenVINS": Log(poses_with_covariances),
-    "poses of OpenVINS, one file": Log(
-        poses_with_covariances, source="estimate.txt", beside={"truth": "truth.txt"}
-    ),
     "states of OpenVINS with an IMU's intrinsics": Log(states(1, imu=(30, 28)), OF_SIGMAS),
     **{
         f"TUM, {encoding}": Log(rewritten(lambda _, row: " ".join(row), encoding))
@@ -547,11 +544,6 @@ LOGS = {
             lambda i, row: ",".join([str(i), *row]),
             title=lambda count: "".join(f",{i}" for i in "abcdefghijklmnopqrstuv"[:count]),
         )
-    ),
-    "TUM, one .csv": Log(
-        trajectories("t x y z qx qy qz qw", between=" "),
-        source="estimate.csv",
-        beside={"covariance": "covariance.txt", "truth": "truth.csv"},
     ),
     "TUM, w first and nanoseconds": Log(
         trajectories("t x y z qw qx qy qz", between=",", nanoseconds=True)
@@ -663,7 +655,6 @@ LOGS = {
             ("run.mcap", "pose_with_covariance_stamped", "odometry"),
             ("run.bag", "odometry", "transform_stamped"),
             ("run.mcap", "odometry", "path"),
-            ("run.bag", "odometry", "pose_with_covariance_stamped"),
         )
     },
     **{

@@ -290,22 +290,20 @@ class Aligned(NamedTuple):
     """The log of the estimate's unit relative to the truth's, of what was done to every run."""
 
 
-def aligned(
-    poses: Poses, convention: Convention, align: str, axes: Axes | Bool[np.ndarray, " t"]
-) -> Aligned:
+def aligned(poses: Poses, align: str, axes: Axes | Bool[np.ndarray, " t"]) -> Aligned:
     """The estimates aligned by `none`, `first`, `yaw` (and position), `se3` or `sim3`.
 
     Where the first pose is known, with no variance on these `axes` of the covariances, or a small
     one, it is by the first pose, and with `first` in any case; else to all positions. The first
     position then is the origin, also of scaling. Raises ValueError for what does not go together.
     """
-    given = convention.scale == "given"
+    given = poses.convention.scale == "given"
     if align == "none":
         return Aligned(poses, given)
     runs = range(len(poses.logged))
     places = runs, np.argmax(poses.logged, axis=1)
     known = exactly_known(poses.covariances[places][:, axes][:, :, axes]).all()
-    here = _carried(poses, convention, _SPLIT)
+    here = carried(poses, _SPLIT)
     any_first = align == "first" and not known
     if known or any_first or (not given and align != "sim3" and _small_at_first(here, align)):
         truths = here.truths.copy()
@@ -325,7 +323,7 @@ def aligned(
         if align != "yaw" and any(_line(run) is not None for run in _runs(here)):
             notes += (STRAIGHT,)
     moved, log_scale = _laid(here, lay, joint)
-    return Aligned(_carried(moved, _SPLIT, convention), given, notes, log_scale)
+    return Aligned(carried(moved, poses.convention), given, notes, log_scale)
 
 
 def _laid(
@@ -348,12 +346,13 @@ def _laid(
     return poses._replace(estimates=T, joint=joint), log_scale
 
 
-def _carried(poses: Poses, old: Convention, new: Convention) -> Poses:
+def carried(poses: Poses, new: Convention) -> Poses:
     """The same poses, with covariances of errors of another convention."""
-    P, joint = converted(poses.covariances, poses.estimates, old, new), poses.joint
+    T, old, joint = poses.estimates, poses.convention, poses.joint
+    P = converted(poses.covariances, T, old, new)
     if joint is not None:
-        joint = _joint(joint, change(poses.estimates, old, new))
-    return poses._replace(covariances=P, joint=joint)
+        joint = _joint(joint, change(T, old, new))
+    return poses._replace(covariances=P, convention=new, joint=joint)
 
 
 def _joint(P: Joints, J: Float[np.ndarray, "runs steps t t"]) -> Joints:
@@ -369,7 +368,7 @@ def _runs(poses: Poses) -> Iterator[Poses]:
         if poses.joint is not None:
             rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
             joint = poses.joint[run][np.ix_(rows, rows)]
-        yield Poses(*(x[run, own] for x in poses[:4]), joint)
+        yield poses.at((run, own), joint)
 
 
 def _small_at_first(poses: Poses, align: str) -> bool:

@@ -22,7 +22,7 @@ from jaxslam.evaluation.alignment import (
     similarity,
 )
 from jaxslam.evaluation.clock import increments
-from jaxslam.evaluation.convention import Convention, Matrices, geometry_of
+from jaxslam.evaluation.convention import Matrices, geometry_of
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.sanity_checks import Mistake
@@ -55,7 +55,6 @@ class _Case(NamedTuple):
     """Poses whose errors are larger than σ says, and how they were compared."""
 
     poses: Poses
-    convention: Convention
     align: str
     found: Evaluation
     compared: Compared
@@ -69,17 +68,15 @@ class _Case(NamedTuple):
         return f"NEES is {_nees(fixed):.4g} instead of {_nees(self.found):.4g}"
 
 
-def causes(
-    poses: Poses, convention: Convention, align: str, found: Evaluation, compared: Compared
-) -> Iterator[Mistake]:
+def causes(poses: Poses, align: str, found: Evaluation, compared: Compared) -> Iterator[Mistake]:
     """The causes of an evaluation that found a filter over-confident; none of others."""
     yield from _repeated(poses)
-    if not suspect(found) or convention.scale == "given":
+    if not suspect(found) or poses.convention.scale == "given":
         return
     few = poses.some()
     if few is not poses:
         poses, found = few, compared(few, align, ())
-    case = _Case(poses, convention, align, found, compared)
+    case = _Case(poses, align, found, compared)
     turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
     looks = (*((_w_first,) if turns else ()), _worlds, _tilt, _mounting)
     for look in (*looks, *((_half_angles,) if turns else ())):
@@ -145,8 +142,10 @@ def _w_first(case: _Case) -> Mistake | None:
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
         return None
-    for name, which in (("estimate", "estimates"), ("truth", "truths")):
-        changed = poses._replace(**{which: _reread(getattr(poses, which), there)})
+    for name, changed in (
+        ("estimate", poses._replace(estimates=_reread(poses.estimates, there))),
+        ("truth", poses._replace(truths=_reread(poses.truths, there))),
+    ):
         if off(changed.estimates, changed.truths) < before / 4:
             fixed = case.again(changed)
             return Mistake(
@@ -266,7 +265,7 @@ def _fitted(case: _Case, X: Float[np.ndarray, "d d"], *, lever: bool) -> Float[n
 
 def _in_world(case: _Case, poses: Poses) -> Poses:
     axes = np.arange(geometry_of(poses.estimates).tangent_dim)
-    return aligned(poses, case.convention, case.align, axes).poses
+    return aligned(poses, case.align, axes).poses
 
 
 def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
@@ -371,7 +370,7 @@ def _half_angles(case: _Case) -> Mistake | None:
     for part in filter(None, off.values()):
         if abs(np.mean(part)) > np.log(HALF) or np.ptp(part) > 3 * np.log(HALF):
             return None
-    names: Sequence[str] = case.convention.names(geometry_of(case.poses.estimates))
+    names: Sequence[str] = case.poses.convention.names(geometry_of(case.poses.estimates))
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in names])
     P = scale[:, None] * case.poses.covariances * scale
     fixed = case.again(case.poses._replace(covariances=P))

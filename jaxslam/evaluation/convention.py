@@ -20,7 +20,7 @@ All matrices that change one into another have determinant one: a wrong conventi
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -35,11 +35,11 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
-from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
+from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, in_seconds
+from jaxslam.io.logs.log import MIXED, Log, in_seconds
 from jaxslam.io.logs.unnamed import is_deviations, without_values
-from jaxslam.io.text import read_table
+from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import write_table
 
 Joints = Float[np.ndarray, "runs k k"]
@@ -143,7 +143,7 @@ def pose_errors(
     T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
     result = np.empty((len(T), geometry_of(T).tangent_dim))
     for part in blocks(len(T)):
-        error = _in_float64(_errors, convention.error, T[part], true[part])
+        error = _in_float64(_error, convention.error, T[part], true[part])
         result[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), error)
     return result.reshape(*estimates.shape[:-2], -1)
 
@@ -180,7 +180,7 @@ def converted(
     new: Convention,
 ) -> Float[np.ndarray, "*batch t t"]:
     """Convert covariances of poses from one convention to another."""
-    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64)
+    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
     transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
     return P
 
@@ -250,7 +250,7 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
 def _in_float64(
     function: Callable[..., Result], error: str, *arrays: Float[np.ndarray, "*batch _ _"]
 ) -> Result:
-    """Apply a function of poses to all of them, as NumPy's arrays.
+    """Apply a function of single poses to all of them, as NumPy's arrays.
 
     Their number is filled up to a power of two, so that few programs serve logs of all sizes.
     """
@@ -259,7 +259,7 @@ def _in_float64(
     more = (1 << (count - 1).bit_length()) - count
     filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
     with jax.enable_x64(True):
-        result = jax.device_get(function(error, geometry_of(arrays[0]), *filled))
+        result = jax.device_get(_of_each(function, error, geometry_of(arrays[0]), *filled))
     return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
 
 
@@ -273,35 +273,23 @@ def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
     return jnp.concatenate([truth.translation() - estimate.translation(), turn])
 
 
-@eqx.filter_jit
-def _errors(error: str, geometry: Geometry, estimates: Array, truths: Array) -> Array:
-    of = geometry.group.from_matrix
-    return jax.vmap(lambda T, true: _error(error, of(T), of(true)))(estimates, truths)
-
-
-@eqx.filter_jit
 def _truth_derivatives(
-    error: str, geometry: Geometry, estimates: Array, truths: Array, firsts: Array
-) -> tuple[Array, Array]:
-    of, zero = geometry.group.from_matrix, jnp.zeros(geometry.tangent_dim, estimates.dtype)
+    error: str, estimate: Pose, truth: Pose, first: Pose
+) -> tuple[Float[Array, "t t"], Float[Array, "t t"]]:
+    by_truth = jacobian(lambda T: _error(error, estimate, T), truth)
+    return by_truth, jacobian(lambda F: _error(error, F @ first.inverse() @ estimate, truth), first)
 
-    def one(estimate, truth, first):
-        T, true, F = of(estimate), of(truth), of(first)
 
-        def by_truth(eta):
-            return _error(error, T, true @ exp(geometry.group, eta))
-
-        def by_first(eta):
-            return _error(error, F @ exp(geometry.group, eta) @ F.inverse() @ T, true)
-
-        return jax.jacfwd(by_truth)(zero), jax.jacfwd(by_first)(zero)
-
-    return jax.vmap(one)(estimates, truths, firsts)
+@eqx.filter_jit
+def _of_each(
+    function: Callable[..., Result], error: str, geometry: Geometry, *matrices: Matrices | Array
+) -> Result:
+    of = geometry.group.from_matrix
+    return jax.vmap(lambda *T: function(error, *map(of, T)))(*matrices)
 
 
 ANGLES = {"rad": 1.0, "deg": np.pi / 180, "half": 2.0}
 """Units of angles, in radians: `half` is the vector part of a quaternion, as in g2o."""
-_WORDS = (*CHOICES, "angle", "length")
 ROUNDED = 1e-6
 """The least eigenvalue, of the greatest number, of a covariance that was rounded."""
 _ROWS, _COLUMNS = np.triu_indices(6)
@@ -350,11 +338,12 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     `ValueError`, naming the file, for a line of other numbers, or that are not finite, and for a
     word of the header that is not known.
     """
-    return covariances_of_file(path, t)[0]
+    found = covariances_of_file(path, t)
+    return CovarianceText(found.times, found.covariances, dict(found.said))
 
 
-def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, tuple[str, ...]]:
-    """The same, and remarks on what was made of the file."""
+def covariances_of_file(path: str | Path, t: int = 6) -> Log:
+    """The same, as a log without poses."""
     triangle = t * (t + 1) // 2
     kinds = {
         1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
@@ -364,8 +353,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     table = read_table(path, "covariances", "covariances", kinds[1 + triangle])
     count, of_names, rows = table.rows.shape[1], named.read(table), table.rows
     if of_names is not None and len(of_names.covariances):
-        told = CovarianceText(of_names.times, of_names.covariances, dict(of_names.said))
-        return told, of_names.notes
+        return of_names
     deviations = t == 6 and is_deviations(rows)
     expected = kinds.get(count, kinds[1 + triangle])
     if deviations:
@@ -374,10 +362,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1))
     if wrong.size or not (deviations or count in kinds):
         raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
-    try:
-        said = {**(MIXED if deviations else {}), **_said(" ".join(table.comments))}
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    said, unit = _said(table, MIXED if deviations else {})
     P = np.full((len(rows), t, t), np.nan)
     times, notes = in_seconds(table, rows[:, 0])
     if deviations or count == 1 + t:
@@ -388,10 +373,9 @@ def covariances_of_file(path: str | Path, t: int = 6) -> tuple[CovarianceText, t
     else:
         P[there], more = _of_triangle(path, rows[there, 1:], t)
         notes += more
-    unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
     names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
-    return CovarianceText(times, scale[:, None] * P * scale, said), notes
+    return Log(times, np.empty((0, 4, 4)), scale[:, None] * P * scale, said, notes)
 
 
 def _of_triangle(
@@ -427,15 +411,20 @@ def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndar
     return sigma**2
 
 
-def _said(comments: str) -> dict[str, str]:
-    """The words `key=value` of a header. Raises ValueError for misspelt keys and unknown values."""
-    said = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", comments))
-    for key in said:
-        if meant := suggestion(key, _WORDS) if key not in _WORDS else "":
-            raise ValueError(
-                f"unknown key {key!r} in the header{meant}; known: {', '.join(_WORDS)}"
-            )
-    known = {**CHOICES, "angle": tuple(ANGLES)}
-    for key in known.keys() & said.keys():
-        lookup(key, [said[key]], dict.fromkeys(known[key]))
-    return {key: value for key, value in said.items() if key in _WORDS}
+def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], float]:
+    """The words of a convention in a header, and its unit of angles, in radians. Raises ValueError
+    for misspelt keys and unknown values."""
+    told = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", " ".join(table.comments)))
+    known = {**CHOICES, "angle": tuple(ANGLES), "length": ()}
+    try:
+        for key in told:
+            if meant := suggestion(key, known) if key not in known else "":
+                raise ValueError(
+                    f"unknown key {key!r} in the header{meant}; known: {', '.join(known)}"
+                )
+            if known.get(key):
+                lookup(key, [told[key]], dict.fromkeys(known[key]))
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}") from None
+    said = {key: value for key, value in told.items() if key in CHOICES}
+    return {**default, **said}, ANGLES[told.get("angle", "rad")]

@@ -3,9 +3,9 @@
 A wrong convention keeps the determinant of a covariance, so that it raises the expected NEES, and
 the one with the least NEES is the most likely, whatever the filter's σ is wrong by. (Of a part of
 the axes the determinant may change: `NEES det(P)^(1/dof)` is compared.) It is distinguished from
-another where the runs' averages of NEES differ by more than they scatter, pair by pair; and it
-*makes the data consistent* where nothing is proven against the NEES of all axes, nor of position or
-rotation alone.
+another where the runs' averages of NEES differ by more than they scatter, pair by pair, or where
+few runs are far likelier with it. It *makes the data consistent* where nothing is proven against
+the NEES of all axes, nor of position or rotation alone.
 
 A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
 position at least from n to n − 1. Only where it lowers it further, so that no σ explains it, is
@@ -27,6 +27,11 @@ from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disprove
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
+FEW = 30
+"""The most runs that may be too few for their scatter, and are judged by likelihood too."""
+LIKELIER = float(np.log(1000 * 100 * 24))
+"""The log of how many times as likely the runs must be: 1000, for each of 100 factors that σ may
+be wrong by with the better convention, and of the conventions of which that is the best."""
 _TOLD = 3
 """The most indistinguishable conventions that a sentence names."""
 _ALIKE = " (right and split errors are the same to first order)"
@@ -194,7 +199,7 @@ def identify(
 
 def _better(own: Tried, best: Tried) -> tuple[int, int] | None:
     """In how many runs, and of how many, the best one fits better, if it does beyond doubt."""
-    if not _worse(own.nees, best.nees):
+    if not _distinguished(own, best):
         return None
     lower = np.nanmean(best.nees, axis=1) < np.nanmean(own.nees, axis=1)
     return int(lower.sum()), len(lower)
@@ -212,12 +217,8 @@ def _best(tried: Mapping[Convention, Tried]) -> tuple[Convention | None, tuple[C
         return None, ()
     weight = {c: np.exp(x.log_determinant / x.dof) for c, x in tried.items()}
     best = min(tried, key=lambda c: weight[c] * float(np.nanmean(tried[c].nees)))
-    equal = tuple(
-        c
-        for c, x in tried.items()
-        if not _worse(weight[c] / weight[best] * x.nees, tried[best].nees)
-    )
-    return best, equal
+    weighted = {c: x._replace(nees=weight[c] / weight[best] * x.nees) for c, x in tried.items()}
+    return best, tuple(c for c, x in weighted.items() if not _distinguished(x, tried[best]))
 
 
 def _scale_was_free(marginal: Tried, given: Tried) -> bool:
@@ -226,6 +227,25 @@ def _scale_was_free(marginal: Tried, given: Tried) -> bool:
     if n < 2 or marginal.position is None or given.position is None:
         return False
     return _worse(marginal.position, n / (n - 1) * given.position)
+
+
+def _distinguished(other: Tried, best: Tried) -> bool:
+    """Whether the best is the better one beyond doubt: by the scatter of runs, or by likelihood.
+
+    Of few runs along one path a wrong NEES is the square of one number a run, and scatters so much
+    that nothing is known of its mean. But let the other be right up to a factor of σ, the likeliest
+    one: then the best is k times as likely with a chance of 1/k, also of correlated steps, by the
+    mean of their logs (Jensen).
+    """
+    if _worse(other.nees, best.nees):
+        return True
+    own, least = (np.nanmean(x.nees, axis=1) for x in (other, best))
+    noticed = 0 < (1 + NOTICEABLE) * np.mean(least) <= np.mean(own)
+    if not noticed or not 2 <= len(own) <= FEW:
+        return False
+    ratio = (best.dof - best.fitted) / 2 * len(own) * np.log(np.mean(own) / np.mean(least))
+    in_most = np.mean(own > least) > 0.5  # not for one run that was lost
+    return bool(in_most and ratio > LIKELIER)
 
 
 def _worse(nees: PerStep, least: PerStep) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, one_line, read_arrays
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.evaluation.convention import BLOCK, CHOICES, Joints, Values, blocks, geometry_of
+from jaxslam.evaluation.convention import (
+    BLOCK,
+    CHOICES,
+    Convention,
+    Joints,
+    Values,
+    blocks,
+    geometry_of,
+)
 from jaxslam.io.logs.log import check_seconds
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
@@ -321,6 +329,8 @@ class Poses(NamedTuple):
     truths: Float[np.ndarray, "runs steps d d"]
     logged: Mask
     """A mask of the steps that are there; the others are identities, of unit covariance."""
+    convention: Convention
+    """The errors that the covariances are of."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
 
@@ -331,8 +341,13 @@ class Poses(NamedTuple):
             return self
         first = np.argmax(self.logged, axis=1)
         steps = np.union1d(np.arange(0, self.logged.shape[1], every), first)
-        few = (x[:, steps] for x in (self.estimates, self.covariances, self.truths, self.logged))
-        return Poses(*few)
+        return self.at((slice(None), steps))
+
+    def at(self, places: tuple[Any, ...], joint: np.ndarray | None = None) -> Poses:
+        """Those at some places, and their joint covariance."""
+        arrays = self.estimates, self.covariances, self.truths, self.logged
+        T, P, truths, logged = (x[places] for x in arrays)
+        return Poses(T, P, truths, logged, self.convention, joint)
 
 
 def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
@@ -349,7 +364,9 @@ def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
     return np.where(there, squared, 0.0)
 
 
-def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
+def checked_poses(
+    estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike, convention: Convention
+) -> Poses:
     """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
     matrices = "(runs, steps, 4, 4) or (…, 6), in the plane (runs, steps, 3, 3) or (…, 3)"
     T, truth = _matrices("estimates", estimates, matrices), _matrices("truths", truths, matrices)
@@ -381,7 +398,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
     _check_rigid("estimates", T)
     _check_rigid("truths", truth)
-    return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
+    return Poses(T, filled(P, logged, np.eye(t)), truth, logged, convention, joints)
 
 
 def without_unknown(

@@ -349,15 +349,15 @@ def _remarks(read: list[RunLog]) -> Iterator[str]:
 
 def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
     """The convention of all runs. Raises ValueError where their files say different ones."""
-    first = read[0].logs
-    for one in (one.logs for one in read):
-        if one.covariances.said != first.covariances.said:
+    said = {one.logs.files.of_covariances: one.logs.covariances.said for one in read}
+    (first, of_first), *others = said.items()
+    for place, own in others:
+        if own != of_first:
             raise ValueError(
-                f"{one.files.of_covariances} states a different convention "
-                f"({one.covariances.convention}) from {first.files.of_covariances} "
-                f"({first.covariances.convention})"
+                f"{place} states a different convention ({Convention(**own)}) from {first} "
+                f"({Convention(**of_first)})"
             )
-    return stated_before(first.covariances.said, stated)
+    return stated_before(of_first, stated)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
@@ -368,11 +368,11 @@ def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
     return result
 
 
-def stated_before(said: dict[str, str], stated: dict[str, str]) -> Convention:
+def stated_before(said: Mapping[str, str], stated: dict[str, str]) -> Convention:
     """The convention as stated, else as in the files; a stated error overrides their axes too."""
     if "error" in stated:
         said = {name: value for name, value in said.items() if name != "axes"}
-    return Convention(**(said | stated))
+    return Convention(**{**said, **stated})
 
 
 def named(

@@ -19,7 +19,6 @@ from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
-    CovarianceText,
     converted,
     covariances_of_file,
     geometry_of,
@@ -65,7 +64,8 @@ class RunLogs:
     files: RunFiles
     estimate: Log
     truth: Log
-    covariances: CovarianceText
+    covariances: Log
+    """The log itself, or the one of a file of covariances alone."""
     oriented: bool
     """Whether estimate and truth have orientations."""
     notes: tuple[str, ...]
@@ -131,14 +131,13 @@ def read_run(run: RunFiles) -> RunLogs:
             "not both have stamps: lines would be paired by their numbers; give times (times.txt "
             "beside them, or lines of TUM)"
         )
-    text, notes = CovarianceText(log.times, log.covariances, dict(log.said)), ()
+    own = log
     if run.covariance is not None:
-        text, notes = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
-        text, rounded = _stamped_by(log.times, text)
-        notes += rounded
-        _check_times(run.covariance, text.times)
-        last = _last_of_each(text.times)
-        text = text._replace(times=text.times[last], covariances=text.covariances[last])
+        own = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
+        own = _stamped_by(log.times, own)
+        _check_times(run.covariance, own.times)
+        last = _last_of_each(own.times)
+        own = own._replace(times=own.times[last], covariances=own.covariances[last])
     elif not len(log.covariances):
         raise ValueError(
             f"{run.estimate} has no covariances, and beside it there is no covariance.txt or "
@@ -146,18 +145,19 @@ def read_run(run: RunFiles) -> RunLogs:
         )
     there = ~np.isnan(log.poses[:, 0, 0])
     oriented, told = _oriented(log._replace(poses=log.poses[there]), truth)
-    notes = (*log.notes, *truth.notes, *notes, *_other_frames(log, truth), *told)
-    return RunLogs(run, log, truth, text, oriented, notes)
+    logs = (log, truth) if own is log else (log, truth, own)
+    notes = (*(x for one in logs for x in one.notes), *_other_frames(log, truth), *told)
+    return RunLogs(run, log, truth, own, oriented, notes)
 
 
 def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     """The poses of a run at the same times, whose clock is behind the truth's by an offset in
     seconds, or `auto`. Raises ValueError where few poses can be compared.
     """
-    log, text, notes = logs.estimate, logs.covariances, list(logs.notes)
-    P, at, of = _nearest(log.times, text.times, text.covariances)
+    log, own, notes = logs.estimate, logs.covariances, list(logs.notes)
+    P, at, of = _nearest(log.times, own.times, own.covariances)
     if not len(at):
-        raise _nothing_in_common(logs.files, logs.files.of_covariances, log.times, text.times)
+        raise _nothing_in_common(logs.files, logs.files.of_covariances, log.times, own.times)
     P = without_unknown(P[None])[0]
     if isinstance(logs.files.estimate, ros.Topic) and logs.files.covariance is None:
         P = _filled_in(logs.files.estimate, P)
@@ -178,8 +178,8 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
         raise _nothing_in_common(logs.files, logs.files.truth, times, logs.truth.times)
     left_out |= _counted(f"poses have no covariance {_WITHIN}", np.isnan(P[:, 0, 0]))
     left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
-    if unused := len(text.times) - len(np.unique(of)):
-        left_out["covariances are at no time of the estimate"] = unused, len(text.times)
+    if unused := len(own.times) - len(np.unique(of)):
+        left_out["covariances are at no time of the estimate"] = unused, len(own.times)
     those = evaluated_poses(logs.files.estimate.parent, stamps, exactly_known(P))
     for what, others in those.others.items():
         left_out |= _counted(what, others)
@@ -226,17 +226,15 @@ def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
         )
 
 
-def _stamped_by(
-    times: Float[np.ndarray, " n"], text: CovarianceText
-) -> tuple[CovarianceText, tuple[str, ...]]:
+def _stamped_by(times: Float[np.ndarray, " n"], own: Log) -> Log:
     """With the stamps of the estimate, line by line, where its own are those rounded."""
-    if len(times) != len(text.times) or len(np.unique(text.times)) == len(times):
-        return text, ()
-    digits = np.diff(np.unique(text.times)).min(initial=np.inf)
-    if not np.isfinite(digits) or np.abs(times - text.times).max() > digits:
-        return text, ()
+    if len(times) != len(own.times) or len(np.unique(own.times)) == len(times):
+        return own
+    digits = np.diff(np.unique(own.times)).min(initial=np.inf)
+    if not np.isfinite(digits) or np.abs(times - own.times).max() > digits:
+        return own
     note = f"times of covariances are rounded to {digits:.3g} s: they are taken line by line"
-    return text._replace(times=times), (note,)
+    return own._replace(times=times, notes=(*own.notes, note))
 
 
 def _nearest(
@@ -319,7 +317,7 @@ def _truths(
     gap, step = (np.median(np.diff(x)) if len(x) > 1 else 0.0 for x in (times, log.times))
     off = np.abs(log.times[at] - times[of]).max() if len(at) else np.inf
     wrong = _interpolation_error(times, poses)
-    sigma = _sigmas(log, P, logs.covariances.convention)
+    sigma = _sigmas(log, P, Convention(**logs.covariances.said))
     most = (wrong / sigma)[: 2 if oriented else 1].max()
     elsewhere, dense = off > 1e-6 * max(gap, step), gap <= SPARSE * step
     if elsewhere and dense and most <= DENSE:

@@ -54,6 +54,16 @@ BEYOND = (
 )
 
 
+class PoseComparison(NamedTuple):
+    """How poses are compared with the truth."""
+
+    align: str = "none"
+    used: tuple[str, ...] = ()
+    """The names of the axes; none where they are to be found."""
+    truth_sigma: tuple[float, float] | None = None
+    """The σ of the true poses, m and degrees; None of exact ones."""
+
+
 class _Compared(NamedTuple):
     """Poses along the axes used, of all steps that are not known by definition."""
 
@@ -95,16 +105,16 @@ def evaluate_poses(
             f"convention must be a jaxslam.Convention, such as Convention('right'), not {stated}"
         )
     lookup("align", [align], dict.fromkeys(ALIGNMENTS))
-    poses = checked_poses(estimates, covariances, truths)
+    poses = checked_poses(estimates, covariances, truths, stated)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
-    found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
-    identified = _identified(poses, stated, align, found.names, sigma)
+    found = as_stated(poses, PoseComparison(align, axes_named(axes_used, poses), sigma))
+    identified = _identified(poses, PoseComparison(align, found.names, sigma))
     at = at[len(at) - found.steps :]
 
     def compared(poses: Poses, align: str, axes: Sequence[str]) -> Evaluation:
-        return as_stated(poses, stated, align, tuple(axes) or found.names, sigma)
+        return as_stated(poses, PoseComparison(align, tuple(axes) or found.names, sigma))
 
-    told = tuple(causes(poses, stated, align, found, compared))
+    told = tuple(causes(poses, align, found, compared))
     if not told and identified.doubtful and not identified.stands:
         best = identified.nees[identified.consistent[0]]
         what = "the convention of the covariances is another"
@@ -113,32 +123,19 @@ def evaluate_poses(
     return described(found, causes=told, **how)
 
 
-def as_stated(
-    poses: Poses,
-    stated: Convention,
-    align: str = "none",
-    used: tuple[str, ...] = (),
-    truth_sigma: tuple[float, float] | None = None,
-) -> Evaluation:
+def as_stated(poses: Poses, asked: PoseComparison) -> Evaluation:
     """The verdict in the convention that is stated, without a look at others."""
-    told: tuple[str, ...] = ()
-    if not used:
-        used, told = estimated(poses, stated, align)
-    found = _compared(poses, stated, align, used, truth_sigma).found
+    used, told = (asked.used, ()) if asked.used else estimated(poses, asked.align)
+    found = _compared(poses, asked._replace(used=used)).found
     return described(found, notes=(*told, *found.notes))
 
 
-def _compared(
-    poses: Poses,
-    convention: Convention,
-    align: str,
-    used: tuple[str, ...],
-    truth_sigma: tuple[float, float] | None,
-) -> _Compared:
+def _compared(poses: Poses, asked: PoseComparison) -> _Compared:
     """The errors and covariances along the axes used, aligned, at one scale where it is free."""
+    (align, used, truth_sigma), convention = asked, poses.convention
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
-    world = aligned(poses, convention, align, axes)
+    world = aligned(poses, align, axes)
     errors = pose_errors(convention, world.poses.estimates, world.poses.truths)[..., axes]
     P = _along(world.poses.covariances, axes)
     start, logged, known = without_known(errors, P, world.poses.logged)
@@ -148,14 +145,14 @@ def _compared(
     if world.given or align == "sim3":
         whitened(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
-        later = _with_truth(world, later, convention, axes, truth_sigma)
+        later = _with_truth(world, later, axes, truth_sigma)
         P, (metres, degrees) = _along(later.covariances, axes), truth_sigma
         notes += (f"every stated σ includes that of the truth, {metres:g} m and {degrees:g}°",)
     if world.given:
-        errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
+        errors, P, fitted, axis_fitted, scale = at_one_scale(later, axes)
         notes += (BEYOND,)
     elif align == "sim3":
-        scale = of_aligned(later, convention, axes, world.log_scale)
+        scale = of_aligned(later, axes, world.log_scale)
     found = of_steps(
         errors,
         P,
@@ -163,7 +160,7 @@ def _compared(
         quantity="NEES",
         times=step_times(None, poses.estimates.shape[1])[start:],
         timed=False,
-        names=used,
+        names=tuple(names[i] for i in axes),
         convention=convention,
         alignment=align,
         notes=notes,
@@ -184,61 +181,52 @@ def _later(poses: Poses, start: int, logged: Mask) -> Poses:
     t, there = poses.covariances.shape[-1], logged[:, start:]
     P = filled(poses.covariances[:, start:], there, np.eye(t))
     joint = None if poses.joint is None else poses.joint[:, start * t :, start * t :]
-    return Poses(poses.estimates[:, start:], P, poses.truths[:, start:], there, joint)
+    T, truths = poses.estimates[:, start:], poses.truths[:, start:]
+    return Poses(T, P, truths, there, poses.convention, joint)
 
 
 def _with_truth(
-    world: Aligned,
-    later: Poses,
-    convention: Convention,
-    axes: Axes,
-    truth_sigma: tuple[float, float],
+    world: Aligned, later: Poses, axes: Axes, truth_sigma: tuple[float, float]
 ) -> Poses:
     """Add the σ of the truth, in the unit of the estimate where their ratio is free."""
     first, log_scale = np.argmax(world.poses.logged, axis=1), np.zeros(len(later.logged))
     by_first = {BY_ANY, BY_FIRST, BY_SMALL} & {*world.notes}
     firsts = world.poses.truths[range(len(first)), first] if by_first else None
     if world.given:
-        log_scale = np.nan_to_num(at_one_scale(later, convention, axes).scale.log_scale)
-    return with_truth(later, convention, truth_sigma, np.exp(log_scale), firsts)
+        log_scale = np.nan_to_num(at_one_scale(later, axes).scale.log_scale)
+    return with_truth(later, truth_sigma, np.exp(log_scale), firsts)
 
 
-def _identified(
-    poses: Poses,
-    stated: Convention,
-    align: str,
-    used: tuple[str, ...],
-    truth_sigma: tuple[float, float] | None,
-) -> Identification:
+def _identified(poses: Poses, asked: PoseComparison) -> Identification:
     """Identify the convention among those of the same scale; else among those given the scale."""
-    geometry, poses = geometry_of(poses.estimates), poses.some()
+    geometry, poses, stated = geometry_of(poses.estimates), poses.some(), poses.convention
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                names = tuple(name for name in convention.names(geometry) if name in used)
-                one = _tried(_compared(poses, convention, align, names, truth_sigma))
-                volume = _log_volume(convention, poses)
-                result[convention] = one._replace(log_determinant=one.log_determinant - volume)
+                other = poses._replace(convention=convention)
+                one = _tried(_compared(other, asked))
+                volume = one.log_determinant - _log_volume(other)
+                result[convention] = one._replace(log_determinant=volume)
         return result
 
     # With one axis of rotation mixed and rpy are world, as in the plane.
-    flat = sum(name.startswith("r") for name in used) < 2
+    flat = sum(name.startswith("r") for name in asked.used) < 2
     turned = stated.axes if stated.axes != "body" else "world"
     same = [c for c in alternatives(stated, geometry) if not flat or c.axes in ("body", turned)]
-    if stated.scale == "given" or align != "none":
+    if stated.scale == "given" or asked.align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
 
 
-def _log_volume(convention: Convention, poses: Poses) -> float:
+def _log_volume(poses: Poses) -> float:
     """The log determinant of a covariance along the convention's axes over that of orthogonal ones:
     angles that follow one another are not."""
-    if convention.axes != "rpy":
+    if poses.convention.axes != "rpy":
         return 0.0
-    volume = np.linalg.slogdet(turning(convention, poses.estimates[poses.logged]))[1]
+    volume = np.linalg.slogdet(turning(poses.convention, poses.estimates[poses.logged]))[1]
     return 2 * float(volume.mean())
 
 
@@ -256,33 +244,29 @@ def _tried(compared: _Compared) -> Tried:
     return Tried(found.nees, found.dof, found.fitted, log_determinant, *parts, int(turns.sum()))
 
 
-def axes_named(
-    axes: str | Sequence[str], poses: Float[np.ndarray, "runs steps d d"], convention: Convention
-) -> tuple[str, ...]:
+def axes_named(axes: str | Sequence[str], poses: Poses) -> tuple[str, ...]:
     """The axes that are used, in the order of a covariance; none where they are not given.
 
     Raises ValueError.
     """
     told = axes.replace(",", " ").split() if isinstance(axes, str) else [str(x) for x in axes]
-    names = convention.names(geometry_of(poses))
+    names = poses.convention.names(geometry_of(poses.estimates))
     used = lookup("axes used", told, dict.fromkeys(names)) if told else {}
     return tuple(name for name in names if name in used)
 
 
-def estimated(
-    poses: Poses, convention: Convention, align: str
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def estimated(poses: Poses, align: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The names of the axes that are estimated, and a word on those that are not.
 
     An axis is left out where all its errors are zero, to nine decimals; or are less
     than a thousandth of σ, and have no correlation with those of other axes.
     """
-    names = convention.names(geometry_of(poses.estimates))
+    names = poses.convention.names(geometry_of(poses.estimates))
     few = poses.some()
-    if few is not poses and not estimated(few, convention, align)[1]:
+    if few is not poses and not estimated(few, align)[1]:
         return names, ()
-    world = aligned(poses, convention, align, ~_constant(poses)).poses
-    e = pose_errors(convention, world.estimates, world.truths)[poses.logged]
+    world = aligned(poses, align, ~_constant(poses)).poses
+    e = pose_errors(poses.convention, world.estimates, world.truths)[poses.logged]
     P = world.covariances[poses.logged]
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
     alone = _alone(P, sigma)
@@ -330,7 +314,6 @@ def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
 
 def with_truth(
     poses: Poses,
-    convention: Convention,
     sigma: tuple[float, float],
     scale: Float[np.ndarray, " runs"],
     firsts: Float[np.ndarray, "runs d d"] | None,
@@ -346,7 +329,7 @@ def with_truth(
     truths = poses.truths.copy()
     truths[..., :n, n] *= scale[:, None, None]
     at = truths if firsts is None else np.broadcast_to(firsts[:, None], truths.shape)
-    J, M = truth_derivatives(convention, poses.estimates, truths, at)
+    J, M = truth_derivatives(poses.convention, poses.estimates, truths, at)
     S = np.ones((len(truths), 1, t)) * np.radians(sigma[1])
     S[..., :n] = sigma[0] * scale[:, None, None]
     J, M = J * S[..., None, :], M * S[..., None, :]

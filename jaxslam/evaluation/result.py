@@ -57,29 +57,6 @@ OUTSIDE = 0.0027
 """The share of a Gaussian beyond ±3σ."""
 
 
-def _coverage(evaluation: Evaluation) -> dict[str, float]:
-    """The shares of all steps inside the 50, 90 and 99 % sets of their covariances."""
-    shares = calibration.coverage(evaluation.nees, evaluation.dof, evaluation.logged)
-    return {f"{100 * p:g}": x for p, x in zip(calibration.SETS, shares, strict=True)}
-
-
-def _bias(evaluation: Evaluation) -> calibration.Bias | None:
-    """The mean errors over σ, of the runs that did not diverge; None of NEES alone."""
-    kept = evaluation.finite
-    if not evaluation.names or not kept.any():
-        return None
-    normalised = evaluation.errors[kept] / evaluation.sigmas[kept]
-    return calibration.bias(normalised, evaluation.logged[kept])
-
-
-def _correlation(evaluation: Evaluation) -> calibration.Correlation | None:
-    """The correlations of whitened errors, of the same runs; None where errors have one axis."""
-    kept = evaluation.finite
-    if evaluation.whitened is None or len(evaluation.names) < 2 or not kept.any():
-        return None
-    return calibration.correlation(evaluation.whitened[kept], evaluation.logged[kept])
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
     """The evaluation of a filter by its errors and covariances; prints as verdict and table.
@@ -97,6 +74,8 @@ class Evaluation:
     """The error of every run, step and axis; NaN where nothing was logged."""
     sigmas: PerAxis
     """The σ that the filter claims of every error."""
+    whitened: PerAxis
+    """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
     times: Float[np.ndarray, " steps"]
     """The time of every step, s, or its number."""
     timed: bool
@@ -125,8 +104,6 @@ class Evaluation:
     """By how many seconds the stamps of the estimate are late and its σ, where that was found."""
     causes: tuple[Mistake, ...] = ()
     """What lies between the logs and makes NEES wrong (`jaxslam.evaluation.causes`)."""
-    whitened: PerAxis | None = None
-    """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
 
     @property
     def runs(self) -> int:
@@ -155,22 +132,17 @@ class Evaluation:
     @cached_property
     def _of_nees(self) -> Verdict:
         with np.errstate(over="ignore"):
-            of = self.errors / self.sigmas, self.dof, self.fitted, self.whitened
-            return _as_assumed(self._verdict(self.nees, *of), self.notes)
+            z = self.errors / self.sigmas
+            return _as_assumed(self._verdict(z, self.whitened, self.dof, self.fitted), self.notes)
 
-    def _verdict(
-        self,
-        nees: np.ndarray,
-        normalised: np.ndarray,
-        dof: int,
-        fitted: float,
-        whitened: np.ndarray | None,
-    ) -> Verdict:
-        if self.quantity == "NIS" and not normalised.shape[-1]:
-            return run_verdict(nees, dof, logged=self.logged) | {"samples": "runs"}
-        if self.quantity == "NIS":
+    def _verdict(self, normalised: PerAxis, whitened: PerAxis, dof: int, fitted: float) -> Verdict:
+        """The verdict on whitened errors, which are over their σ `normalised`."""
+        nees = np.where(self.logged, squared(whitened), np.nan) if self.names else self.nees
+        if self.quantity == "NEES":
+            return run_verdict(nees, dof, fitted, self.logged, whitened)
+        if self.names:
             return innovation_verdict(nees, normalised, dof)
-        return run_verdict(nees, dof, fitted, self.logged, whitened)
+        return run_verdict(nees, dof, logged=self.logged) | {"samples": "runs"}
 
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
@@ -258,9 +230,27 @@ class Evaluation:
         """The share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
         return np.sum(np.abs(self.errors) > 3 * self.sigmas, axis=(0, 1)) / np.sum(self.logged)
 
-    coverage = cached_property(_coverage)
-    bias = cached_property(_bias)
-    correlation = cached_property(_correlation)
+    @cached_property
+    def coverage(self) -> dict[str, float]:
+        """The shares of all steps inside the 50, 90 and 99 % sets of their covariances."""
+        shares = calibration.coverage(self.nees, self.dof, self.logged)
+        return {f"{100 * p:g}": x for p, x in zip(calibration.SETS, shares, strict=True)}
+
+    @cached_property
+    def bias(self) -> calibration.Bias | None:
+        """The mean errors over σ, of the runs that did not diverge; None of NEES alone."""
+        kept = self.finite
+        if not self.names or not kept.any():
+            return None
+        return calibration.bias(self.errors[kept] / self.sigmas[kept], self.logged[kept])
+
+    @cached_property
+    def correlation(self) -> calibration.Correlation | None:
+        """The correlations of whitened errors, of the same runs; None of a single axis."""
+        kept = self.finite
+        if len(self.names) < 2 or not kept.any():
+            return None
+        return calibration.correlation(self.whitened[kept], self.logged[kept])
 
     @property
     def suggested(self) -> Convention | None:
@@ -272,16 +262,11 @@ class Evaluation:
         return self._axis_verdicts[axis]
 
     @cached_property
-    def _axis_verdicts(self) -> tuple[Verdict, ...]:
-        return tuple(self._of_axis(axis) for axis in range(len(self.names)))
-
-    def _of_axis(self, axis: int) -> Verdict:
+    def _axis_verdicts(self) -> list[Verdict]:
         with np.errstate(over="ignore"):
-            normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
-            nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
-            fitted = self.axis_fitted[axis] if self.axis_fitted else 0.0
-            whitened = None if self.whitened is None else normalised
-            return self._verdict(nees, normalised, 1, fitted, whitened)
+            normalised = np.split(self.errors / self.sigmas, len(self.names), axis=-1)
+            fitted = self.axis_fitted or (0.0,) * len(self.names)
+            return [self._verdict(z, z, 1, f) for z, f in zip(normalised, fitted, strict=True)]
 
     def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
         """Return the figure of the evaluation, see `jaxslam.plots.plot_evaluation`."""
@@ -340,7 +325,7 @@ class Evaluation:
         return str(self)
 
     def _repr_html_(self) -> str:
-        return _html(self, self._told())
+        return _html(self, _told(self))
 
     def __getattr__(self, name: str) -> NoReturn:
         meant = suggestion(name, dir(type(self)))
@@ -349,24 +334,7 @@ class Evaluation:
     def __str__(self) -> str:
         table = _in_columns(*_rows(self)) if self.names else []
         counted = [_counted(self), _covered(self)]
-        return "\n".join([self._told(), "", *counted, *table, *self.remarks])
-
-    def _told(self) -> str:
-        """The verdict in lines, or the mistakes of the log in its place."""
-        # Lost runs are named below, by their names here.
-        more = sentences(self._of_nees | {"lost_runs": None}, self.quantity)[1:]
-        told = [self.headline, *more]
-        if self.scale is not None and not self.scale.disproved:
-            told.append(self.scale.sentence)
-        told += _beyond_nees(self)
-        doubt = [] if self.identified is None else [self.identified.sentence]
-        if self.lost_runs:
-            more = len(self.lost_runs) - _LISTED
-            which = ", ".join(self.lost_runs[:_LISTED]) + (f" and {more} more" if more > 0 else "")
-            told.append(f"{'lost' if self.quantity == 'NEES' else 'outlying'}: {which}")
-        if self.mistakes:
-            told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
-        return "\n".join([*told, *doubt])
+        return "\n".join([_told(self), "", *counted, *table, *self.remarks])
 
     @property
     def remarks(self) -> list[str]:
@@ -377,6 +345,26 @@ class Evaluation:
     def expected(self) -> str:
         """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
+
+
+def _told(evaluation: Evaluation) -> str:
+    """The verdict in lines, or the mistakes of the log in its place."""
+    # Lost runs are named below, by their names here.
+    more = sentences(evaluation._of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
+    told = [evaluation.headline, *more]
+    if evaluation.scale is not None and not evaluation.scale.disproved:
+        told.append(evaluation.scale.sentence)
+    told += _beyond_nees(evaluation)
+    doubt = [] if evaluation.identified is None else [evaluation.identified.sentence]
+    if evaluation.lost_runs:
+        more = len(evaluation.lost_runs) - _LISTED
+        which = ", ".join(evaluation.lost_runs[:_LISTED]) + (
+            f" and {more} more" if more > 0 else ""
+        )
+        told.append(f"{'lost' if evaluation.quantity == 'NEES' else 'outlying'}: {which}")
+    if evaluation.mistakes:
+        told, doubt = [evaluation.headline, *(mistake.told for mistake in evaluation.mistakes)], []
+    return "\n".join([*told, *doubt])
 
 
 def described(found: Evaluation, **words: Any) -> Evaluation:
@@ -439,7 +427,7 @@ def latex(evaluation: Evaluation) -> str:
         for symbol, name in symbols.items():
             line = line.replace(symbol, name)
         lines += [line + r" \\", r"\midrule"] if row is first else [line + r" \\"]
-    comments = [f"% {line}" for line in (*evaluation._told().splitlines(), _counted(evaluation))]
+    comments = [f"% {line}" for line in (*_told(evaluation).splitlines(), _counted(evaluation))]
     return "\n".join([*comments, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
+from jaxslam.evaluation.alignment import carried
 from jaxslam.evaluation.convention import (
     Axes,
     Convention,
     Joints,
     Matrices,
     Tangents,
-    converted,
     pose_errors,
 )
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
@@ -141,12 +141,12 @@ class AtScale(NamedTuple):
     scale: Scale
 
 
-def at_one_scale(poses: Poses, convention: Convention, axes: Axes) -> AtScale:
+def at_one_scale(poses: Poses, axes: Axes) -> AtScale:
     """Return errors along some axes at the true scale that explains all poses of a run best."""
     if poses.joint is not None:
-        return _jointly(poses, poses.joint, convention, axes)
+        return _jointly(poses, poses.joint, axes)
     P = poses.covariances[..., axes[:, None], axes]
-    errors, slope = (x[..., axes] for x in _affine(convention, poses.estimates, poses.truths))
+    errors, slope = (x[..., axes] for x in _affine(poses.convention, poses.estimates, poses.truths))
     own = _own_scales(errors, slope, P)
     found = one_scale(*own, poses.logged)
     s = np.exp(np.where(np.isfinite(found.log_scale), found.log_scale, 0.0))
@@ -199,12 +199,12 @@ def _own_scales(
         return BeyondScale(nees, np.log(s), 1 / (s * np.sqrt(curvature)))
 
 
-def _jointly(poses: Poses, joints: Joints, convention: Convention, axes: Axes) -> AtScale:
+def _jointly(poses: Poses, joints: Joints, axes: Axes) -> AtScale:
     """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
     """
-    e, G = (x[..., axes] for x in _affine(convention, poses.estimates, poses.truths))
+    e, G = (x[..., axes] for x in _affine(poses.convention, poses.estimates, poses.truths))
     t, m = poses.covariances.shape[-1], len(axes)
     left = poses.covariances[..., axes[:, None], axes].copy()
     own, (drift, sigma, nees) = left.copy(), (np.full(e.shape[:2], np.nan) for _ in range(3))
@@ -250,19 +250,16 @@ def _fitted(
     return (1 - float(slope @ residual) / information if information else 1.0), information
 
 
-def of_aligned(
-    poses: Poses, convention: Convention, axes: Axes, log_scale: Float[np.ndarray, " runs"]
-) -> Scale:
+def of_aligned(poses: Poses, axes: Axes, log_scale: Float[np.ndarray, " runs"]) -> Scale:
     """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
     T, truth = poses.estimates.copy(), poses.truths.copy()
     there = poses.logged[..., None, None]
     middle = np.mean(truth, axis=1, where=there, keepdims=True)[..., :-1, -1]
     for x in (T, truth):
         x[..., :-1, -1] -= middle
-    split = Convention("split")
-    P = converted(poses.covariances, poses.estimates, convention, split)
-    P = converted(P, T, split, convention)
-    e, g = (x[..., axes] for x in _affine(convention, T, truth))
+    moved = carried(poses, Convention("split"))._replace(estimates=T, truths=truth, joint=None)
+    P = carried(moved, poses.convention).covariances
+    e, g = (x[..., axes] for x in _affine(poses.convention, T, truth))
     _, own_scale, sigma = _own_scales(e, g, P[..., axes[:, None], axes])
     told = poses.logged & np.isfinite(sigma)
     drift, sigma = np.where(told, own_scale, np.nan), np.where(told, sigma, 1.0)

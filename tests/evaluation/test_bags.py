@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from bags import EPOCH, KINDS, ros_of, write_bag
+from bags import EPOCH, ros_of, write_bag
 from recordings import path_at
 from recordings import write as write_path
 from scipy.spatial.transform import Rotation
@@ -89,7 +89,7 @@ def test_poses_of_two_bodies_are_told(tmp_path):
 
 def test_a_folder_of_bags_is_of_runs_and_tells_the_convention(tmp_path):
     """Written about the body's axes, as by a filter that does not heed what ROS says."""
-    names, runs = ("a.bag", "b.mcap", "c", "d.db3", *(f"{i}.mcap" for i in range(16))), []
+    names, runs = ("a.bag", "b.mcap", "c", "d.db3", *(f"{i}.mcap" for i in range(4))), []
     for seed, name in enumerate(names):
         estimate, world, truth = run(seed)
         M = np.zeros((STEPS, 6, 6))
@@ -180,11 +180,6 @@ def test_bad_messages_are_refused_in_one_line(topics, message, tmp_path):
     r = ros_of("run.bag")
     bag = write_bag(tmp_path / "run.bag", {"/odom": odometry(r), "/gt": poses(r)} | topics(r))
     assert str(bag) in refused(message, bag)
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_a_bag_that_is_nowhere_is_refused(name, tmp_path):
-    refused(f"{name}: (no such file|cannot be read)", tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["", "1.5", "[1]"])

@@ -53,8 +53,6 @@ OF_ARRAYS = [
     (arrays(E[:0], P[:0]), r"errors must be an array .*, not \(0, 7, 3\)"),
     (arrays("many"), "errors must be numbers"),
     (arrays(E.astype(complex)), "errors must be numbers"),
-    (arrays([[1.0, 2.0], [3.0]]), "errors must be numbers"),
-    (arrays(times=[1, 2, 3]), "times must be 7 finite, non-decreasing"),
     (arrays(times=[0, 1, 2, 3, 2, 5, 6]), "times must be 7 finite, non-decreasing"),
     (arrays(times=np.full(7, np.nan)), "times must be 7 finite, non-decreasing"),
     (arrays(times="soon"), "times must be 7 finite, non-decreasing"),
@@ -64,7 +62,6 @@ OF_ARRAYS = [
     (arrays(0 * E, 0 * P), "all covariances are zero"),
     (arrays(changed(E, 3, 0.0), changed(P, 3, 0.0)), "all covariances of run 3 are zero"),
     (nees(-1.0, 3), "NEES of run 0, step 1 is -1; 0 or more"),
-    (nees(1.0, 0), "dof must be one whole number"),
     (nees(1.0, 10**6 + 1), "dof must be one whole number"),
     (lambda: Convention(error="lfet"), "unknown error 'lfet' .did you mean left"),
     (lambda: Convention(axes="camera"), "unknown axes 'camera'; known: body, world, mixed"),
@@ -179,7 +176,6 @@ OF_FILES = [
     (npz(POSES | {"error": []}), "unknown error ''; known: right, left, split"),
     (npz({"errors": ONE, "sigmas": -1.22 * ONE}), r"sigmas of run 0, step 0 must not .* -1\.22"),
     (of_errors(stated={"error": "left"}), "axes used and σ of the truth apply to poses"),
-    (of_errors(axes_used="x"), "axes used and σ of the truth apply to poses"),
     (of_errors(truth_sigma=(1, 1)), "σ of the truth apply to poses"),
     (of_errors(truth="t.txt"), "--truth goes with a trajectory"),
     (of_errors(nis=True, innovations="a.npz"), "--innovations FILE, not both"),
@@ -189,7 +185,6 @@ OF_FILES = [
     (lambda x: evaluate_log(x / "missing.npz"), "no such file or folder"),
     (evaluate_log, r"has neither estimate\.txt nor sub-folders"),
     (with_truth_sigma(-1, 0), "truth_sigma must be"),
-    (with_truth_sigma(1), "truth_sigma must be"),
     (with_truth_sigma(np.nan, 1), "truth_sigma must be"),
     (covariances("0 1 2 3\n"), r"c\.txt, line 1: expected 22 finite numbers"),
     (covariances("# a\n" + "nan " * 22), r"c\.txt, line 2: expected 22 finite numbers"),
@@ -197,7 +192,6 @@ OF_FILES = [
     (covariances("# eror=left\n" + UPPER), r"c\.txt: unknown key 'eror' in the header \(did you"),
     (covariances("# angle=grad\n" + UPPER), r"c\.txt: unknown angle 'grad'"),
     (covariances("#\n"), r"c\.txt has no covariances"),
-    (covariances(f"{DEVIATIONS}\n"), r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+"),
     (covariances(f"{DEVIATIONS}{' 0' * 11}\n"), r"c\.txt: a σ is -0\.1; expected 0 to 1e\+\d+"),
 ]
 
@@ -259,14 +253,8 @@ def frames(old, new):
 
 OF_FOLDERS = [
     (another("run00/trajectory.txt"), r"run00 has both estimate\.txt and trajectory\.txt; keep"),
-    (another("run00/groundtruth.txt"), r"run00 has both truth\.txt and groundtruth\.txt; keep one"),
     (another("estimate.txt"), r"has a run and sub-folders with runs \(run00, run01\)"),
     (without("run01/truth.txt"), r"run01 has no truth\.txt"),
-    (without("run00/estimate.txt"), r"run00 has no estimate\.txt"),
-    (
-        two_runs(lambda x: write_tum(x / "run01/truth.txt", [99.0], np.eye(4)[None])),
-        r"no time stamps in common within 0\.01 s",
-    ),
     (stated(np.eye(6), Convention("left")), "states a different convention"),
     (stated(-np.eye(6), Convention()), ": the covariance of run01, step 0 has variance -1"),
     (
@@ -312,7 +300,6 @@ OF_FOLDERS = [
         r"only 15 can be compared.* half the lines",
     ),
     (frames(",1,,", ",yes,,"), r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
-    (frames("9,0.3", "9,nan0.3"), r"frames\.csv, line 11: expected a finite time"),
     (frames(",1,,", ",0,,"), "every frame with a pose is lost or has no fixed unit"),
     (frames("\n0,0", "\n0,-9"), r"pose at 0\.000 s; it must list the frames of the trajectory"),
     (frames("tracked,0", "tracked,-1"), "line 2: .* the number of a map"),

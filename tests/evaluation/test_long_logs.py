@@ -32,7 +32,7 @@ def test_some_poses_hold_the_first_of_every_run(monkeypatch):
     monkeypatch.setattr(inputs, "MOST", 20)
     T, P, truth = (x.copy() for x in logged(jaxslam.Convention(), runs=2, steps=40))
     T[1, :3] = P[1, :3] = truth[1, :3] = np.nan
-    poses = checked_poses(T, P, truth)
+    poses = checked_poses(T, P, truth, jaxslam.Convention())
     few = poses.some()
     assert isinstance(few, Poses)
     steps = np.union1d(np.arange(0, 40, 4), [3])

@@ -159,3 +159,15 @@ def test_innovations_of_what_was_not_measured_count_for_nothing():
     found = jaxslam.evaluate(*without, quantity="NIS")
     assert found.dof == 2
     np.testing.assert_allclose(found.nees, wanted, rtol=1e-6)
+
+
+def test_covariances_of_rounded_times_are_taken_line_by_line(tmp_path):
+    """Ten poses a second, whose covariances are stamped to whole seconds."""
+    files(tmp_path)
+    write_covariances(
+        tmp_path / "covariance.txt", np.floor(LOG.times), LOG.covariances[0], LOG.convention
+    )
+    found = evaluate_log(tmp_path)
+    there = found.logged[0]
+    np.testing.assert_allclose(found.nees[0, there], WANTED[0][-found.steps :][there], rtol=0.02)
+    assert "times of covariances are rounded to 1 s: they are taken line by line" in found.notes

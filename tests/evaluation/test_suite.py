@@ -231,28 +231,6 @@ def test_controls_are_the_motion_with_its_noise(tmp_path):
     assert abs(np.mean(normalised)) < 4 / np.sqrt(1200)
 
 
-def test_the_measurements_are_the_projections_of_fixed_points(tmp_path):
-    """With the equations of the README: of two views of a landmark follows the third."""
-    scenario = jaxslam.scenario("matched", steps=60, landmarks=8, pixel_sigma=1e-6)
-    write_suite(tmp_path / "suite", [scenario], runs=2)
-    pixels = table(tmp_path / "suite" / "matched" / "measurements.csv")
-    truth = np.array(table(tmp_path / "suite" / "matched" / "truth.csv").tolist())
-    truth = truth.reshape(2, 61, -1)[..., 3:]
-    f, c = scenario.focal[0], scenario.centre[0]
-    checked = 0
-    for run, landmark in np.ndindex(2, 8):
-        rows = pixels[(pixels["run"] == run) & (pixels["landmark"] == landmark)]
-        x, z, turn = truth[run, rows["step"].astype(int)].T
-        # u = f px/pz + c, p = Rᵀ (X − t), is linear in X.
-        b = (rows["u"] - c) / f
-        row = np.stack([np.cos(turn) + b * np.sin(turn), np.sin(turn) - b * np.cos(turn)], 1)
-        side = row[:, 0] * x + row[:, 1] * z
-        point, *_ = np.linalg.lstsq(row, side, rcond=None)
-        np.testing.assert_allclose(row @ point, side, atol=1e-5)
-        checked += len(rows)
-    assert checked > 200
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

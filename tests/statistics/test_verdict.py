@@ -36,12 +36,6 @@ def studies(count, runs, seed=0, **of):
 # --- how often it is wrong ----------------------------------------------------------------------
 
 
-def limits(found):
-    """Of an interval, the upper one of which may be infinite."""
-    low, high = found["interval99"]
-    return low, np.inf if high is None else high
-
-
 def words(many, dof=3):
     return [Tally.of(nees, dof).decisive().word for nees in many]
 
@@ -97,7 +91,7 @@ def test_word_interval_and_p_value_say_the_same(runs):
         nees = scale * studies(1, runs, steps=6, seed=runs)[0]
         found = run_verdict(nees, 3)
         for each in (found, found["mean"], found["end"], *found["thirds"]):
-            low, high = limits(each)
+            low, high = (np.inf if x is None else x for x in each["interval99"])
             assert (low <= 1 <= high) == (each["p"] >= 0.01) == not_disproved(each)
             assert low <= each["sigma_factor"] <= high
         looks = (found["mean"], found["end"], *found["thirds"])
@@ -286,16 +280,6 @@ def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole(fitted):
     assert together["never_lost"]["interval99"] == pytest.approx(whole["never_lost"]["interval99"])
 
 
-def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
-    verdict = run_verdict(np.full((1, 4), 100.0), 3)
-    low, high = verdict["interval99"]
-    assert (verdict["word"], verdict["p"] < 1e-9) == ("over-confident", True)
-    assert 2 < low < verdict["sigma_factor"] < 60 < high
-    least, most = shortfalls(3, 0.005)
-    assert (low, high) == pytest.approx((np.sqrt(100 / most), np.sqrt(100 / least)))
-    assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "cannot tell"
-
-
 @pytest.mark.parametrize(
     ("factor", "text"),
     [
@@ -321,14 +305,11 @@ TALLY = Tally.of(np.ones((5, 4)), 3)
     ("call", "message"),
     [
         (lambda: run_verdict(np.ones(3), 3), "NEES must be"),
-        (lambda: run_verdict(np.ones((0, 4)), 3), "NEES must be"),
         (lambda: run_verdict(np.ones((4, 0)), 3), "NEES must be"),
         (lambda: run_verdict(np.ones((4, 5)), 0), "NEES must be"),
         (lambda: run_verdict(np.ones((4, 5)), 3, logged=np.arange(20).reshape(4, 5) < 15),
          "at least one step per run"),
         (lambda: run_verdict(np.ones((4, 5)), 3, -0.1), "fitted must be from 0 to the 3 degrees"),
-        (lambda: run_verdict(np.ones((4, 5)), 3, 3.1), "fitted must be from 0 to the 3 degrees"),
-        (lambda: run_verdict(np.ones((4, 5)), 3, np.nan), "fitted must be from 0 to the 3 degrees"),
         (lambda: TALLY + Tally.of(np.ones((5, 4)), 6), "runs with 3 and 6 degrees of freedom cann"),
         (lambda: TALLY + Tally.of(np.ones((5, 4)), 3, 0.5), r"with 0\.0 and 0\.5 fitted degrees"),
     ],
@@ -366,13 +347,3 @@ def test_every_run_is_averaged_over_the_steps_that_it_has():
     assert run_verdict(broken, 3, logged=logged)["diverged"] == 1
     broken[0, 2] = 1e6
     assert run_verdict(broken, 3, logged=logged)["lost"] == 1 / 40
-
-
-@pytest.mark.slow
-def test_runs_of_unlike_length_keep_the_rate_of_false_alarms():
-    """Of 600 studies of 30 runs, cut anywhere: 6 expected, 19 or more once in 10 000."""
-    rng, words = np.random.default_rng(9), []
-    for nees in studies(600, 30, seed=10, steps=12):
-        logged = np.arange(12) < rng.integers(1, 13, size=(30, 1))
-        words.append(run_verdict(nees, 3, logged=logged)["word"])
-    assert sum(word.endswith("confident") for word in words) < 19
