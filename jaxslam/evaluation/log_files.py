@@ -183,7 +183,9 @@ def runs_of(
                 "lines hold them, one of covariances (--covariance FILE); arrays need a .npz or "
                 ".csv file"
             )
-        return (RunFiles(source.stem, source, _path(covariance), _truth_of(str(truth))),)
+        of_folder = source.stem in (Path(name).stem for name in ESTIMATES)
+        P = _path(covariance) or (_only(source.parent, COVARIANCES) if of_folder else None)
+        return (RunFiles(source.stem, source, P, _truth_of(str(truth))),)
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
             raise ValueError(

@@ -140,8 +140,9 @@ def read_run(run: RunFiles) -> RunLogs:
         own = own._replace(times=own.times[last], covariances=own.covariances[last])
     elif not len(log.covariances):
         raise ValueError(
-            f"{run.estimate} has no covariances, and beside it there is no covariance.txt or "
-            "state_deviation.txt; give them by --covariance FILE"
+            f"{run.estimate} has no covariances; give them by --covariance FILE (beside "
+            "estimate.txt, trajectory.txt and state_estimate.txt, covariance.txt or "
+            "state_deviation.txt is found by itself)"
         )
     there = ~np.isnan(log.poses[:, 0, 0])
     oriented, told = _oriented(log._replace(poses=log.poses[there]), truth)

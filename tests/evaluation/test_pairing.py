@@ -171,3 +171,14 @@ def test_covariances_of_rounded_times_are_taken_line_by_line(tmp_path):
     there = found.logged[0]
     np.testing.assert_allclose(found.nees[0, there], WANTED[0][-found.steps :][there], rtol=0.02)
     assert "times of covariances are rounded to 1 s: they are taken line by line" in found.notes
+
+
+def test_the_estimate_of_a_folder_has_the_covariances_beside_it(tmp_path):
+    """As the folder itself has; a file of another name is none of the run."""
+    files(tmp_path)
+    estimate, truth = tmp_path / "estimate.txt", tmp_path / "truth.txt"
+    found, whole = evaluate_log(estimate, truth=truth), evaluate_log(tmp_path)
+    np.testing.assert_array_equal(found.nees, whole.nees)
+    other = estimate.rename(tmp_path / "other.txt")
+    with pytest.raises(ValueError, match=r"other\.txt has no covariances; give them by --cov"):
+        evaluate_log(other, truth=truth)
