@@ -94,6 +94,8 @@ AFFINE = {
     "geometry": "spatial",
     "motion": "odometry",
     "sensor": "position",
+    "odometry_sigma": (0.01,) * 3 + (0.003,) * 3,
+    "position_sigma": 0.1,
     "steps": 2000,
     "rate": 1.0,
     "velocity": (0.0, 0.0, 0.2356, 0.0, -2 * math.pi / 400, 0.0),
@@ -159,13 +161,11 @@ def zhang_of(share: float, /, **theirs: Published) -> Study:
     return Study(RAL, world, 100, 8, ZHANG, cartesian(**theirs) | beside, batch=None)
 
 
-def affine(odometry: float, position: float) -> Study:
-    """The circle of Song et al. with another σ of translation and of a measured position."""
-    sigma = (odometry,) * 3 + (0.003,) * 3
-    fields = {**AFFINE, "odometry_sigma": sigma, "position_sigma": position}
+def affine() -> Study:
+    """The circle of Song et al."""
     names = ("world", "fej", "fej2", "oc", "invariant", "decoupled", "robocentric")
     filters = cartesian(**dict.fromkeys(names))
-    return Study(SONG, partial(scenario, "positions", fields), 50, 50, ZHANG[2:], filters)
+    return Study(SONG, partial(scenario, "positions", AFFINE), 50, 50, ZHANG[2:], filters)
 
 
 STUDIES = {
@@ -204,9 +204,7 @@ STUDIES = {
         0.05, invariant=(1.16, 0.027, 1.0, 1.01), fej=(1.24, 0.029, 1.05, 1.13),
         world=(2.0, 0.043, 3.7, 3.1), composed=(2.4, 0.041, 3.0, 7.5),
     ),
-    "affine": affine(0.01, 0.1),
-    "affine-far": affine(0.01, 0.2),
-    "affine-fast": affine(0.02, 0.1),
+    "affine": affine(),
 }  # fmt: skip
 
 
