@@ -604,15 +604,16 @@ def test_runs_in_folders_are_compared_as_far_as_each_goes_and_named_where_they_a
 
 def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     trajectory = pytest.importorskip("jaxslam.tracking.trajectory")
+    given = replace(trajectory.TRACKED, scale="given")
     T, P, truth = logged(trajectory.TRACKED, runs=1, steps=100)
     T, P, truth = T[0], P[0].copy(), truth[0].copy()
     P[0], truth[0] = 0, T[0]
     times = np.arange(100) / 30
     write_tum(tmp_path / "trajectory.txt", times, T)
-    trajectory.write_covariances(tmp_path / "covariance.txt", times, P, given_scale=True)
+    write_covariances(tmp_path / "covariance.txt", times, P, given)
     write_tum(tmp_path / "groundtruth.txt", times, truth)
     found = jaxslam.evaluate_log(tmp_path)
-    assert found.convention == replace(trajectory.TRACKED, scale="given")
+    assert found.convention == given
     assert (found.dof, found.steps, found.fitted) == (6, 99, 1.0)
     best = errors_beyond_scale(trajectory.TRACKED, T[1:], truth[1:], P[1:])
     nees = one_scale(*(np.asarray(x) for x in best)).nees
