@@ -503,6 +503,10 @@ def _run(evaluation: Evaluation, run: int) -> str:
     return evaluation.run_names[run] if evaluation.run_names else f"run {run}"
 
 
+MOST = 1000.0
+"""The factor above which the end of an interval says nothing."""
+
+
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     return [
         ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
@@ -519,6 +523,8 @@ def _row(evaluation: Evaluation, axis: int) -> tuple[str, ...]:
         "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
         for x in (found["sigma_factor"], *found["interval99"])
     )
+    if (found["interval99"][1] or 0) > MOST:
+        high = f"> {MOST:g}"
     outside = f"{evaluation.outside3sigma[axis]:.2%}"
     return evaluation.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
 

@@ -222,6 +222,13 @@ def test_lost_runs_are_named_and_columns_of_the_table_never_run_together():
     assert (diverged.verdict["word"], as_json(diverged)["verdict"]["diverged"]) == ("lost", 1)
 
 
+def test_the_end_of_an_interval_that_says_nothing_is_no_number():
+    """Of one run whose error is one number."""
+    found = jaxslam.evaluate(np.full((1, 30, 1), 3.0), np.ones((1, 30, 1, 1)))
+    assert found.axis_verdict(0)["interval99"][1] > 1000
+    assert "[0.905, > 1000]" in str(found)
+
+
 def test_runs_with_gaps_and_of_unlike_length_are_averaged_over_what_they_have(tmp_path):
     e, P = drawn(factor=1.2)
     e[2, 4:], P[2, 4:], e[5, 1:3], P[5, 1:3] = (np.nan,) * 4
