@@ -82,6 +82,7 @@ OPERATIONS = {
     "select": Operation("(({0} != ZERO) ? {2} : {1})", _select),
     "is_finite": Operation("l_is_finite({0})", _truth(np.isfinite)),
     "sqrt": Operation("l_sqrt({0})", np.sqrt),
+    "cbrt": _called("cbrt", np.cbrt),
     "abs": Operation("l_fabs({0})", np.abs),
     "floor": _called("floor", np.floor),
     "ceil": _called("ceil", np.ceil),

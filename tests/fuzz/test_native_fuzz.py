@@ -10,8 +10,8 @@ from jaxslam.native import batched
 from jaxslam.native.build import compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
-ULPS = 64
-"""XLA's own log1p is 39 from NumPy's and its sinh 14; the native functions are within 3."""
+ULPS = 128
+"""XLA's own cbrt is 101 from NumPy's and its log1p 39; the native functions are within 3."""
 SPECIAL = [np.nan, np.inf, -np.inf, -0.0, 0.0, 1.0, -1.0, 1e-300, 20.0, -750.0, 1e22, 0.5]
 
 
