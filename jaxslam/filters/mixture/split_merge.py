@@ -134,11 +134,12 @@ def _parts(pixels_at: Callable[[Core], Pixels], state: SumState) -> _Parts:
 def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     """So many times, each of other members: the one of the greatest cost split, and two of the
     others merged, if that is a gain; else two merged, if that costs nothing."""
-    parts, one_serves = _as_late(parts)
-    ended = one_serves & (jnp.sum(parts.sum.alive) == 1)
+    parts, cost = _as_late(parts)
+    alone = jnp.sum(parts.sum.alive) == 1
+    one_serves = cost < jnp.where(alone, ACROSS, ENOUGH)
     no = jnp.zeros(rounds, bool)
     places, due, divided = cond(
-        ~ended,
+        ~(alone & one_serves),
         lambda _, *told: _planned(*told, rounds),
         (jnp.zeros((rounds, 3), int), no, no),
         *(parts.sum.log_weights, parts.values, parts.covariances, one_serves),
@@ -147,11 +148,10 @@ def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     return at_places(_replaced, parts.sum, (parts.by_core, split), places, due, None)
 
 
-def _as_late(parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
+def _as_late(parts: _Parts) -> tuple[_Parts, Float[Array, ""]]:
     """What a split may reach: near the end only what is across the values, the displacement; and
-    whether one Gaussian serves."""
+    what the sum costs as one Gaussian."""
     cost = jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
-    alone = jnp.sum(parts.sum.alive) == 1
 
     def across(value, by_core, P):
         squared = value @ value
@@ -159,7 +159,7 @@ def _as_late(parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
         left = jnp.eye(value.size, dtype=value.dtype) - share * jnp.outer(value, value)
         return value, left @ by_core, left @ P @ left
 
-    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost < jnp.where(alone, ACROSS, ENOUGH)
+    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost
 
 
 def _planned(
