@@ -55,6 +55,8 @@ ASSUMED = 1.5
 gauge of all positions as if errors of different poses were independent."""
 OUTSIDE = 0.0027
 """The share of a Gaussian beyond ±3σ."""
+MOST = 1000.0
+"""The factor above which the end of an interval says nothing."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -501,10 +503,6 @@ def _missing(evaluation: Evaluation) -> list[str]:
 
 def _run(evaluation: Evaluation, run: int) -> str:
     return evaluation.run_names[run] if evaluation.run_names else f"run {run}"
-
-
-MOST = 1000.0
-"""The factor above which the end of an interval says nothing."""
 
 
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
