@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam._numerics.arrays import AnyArray, Number
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.layer import AbstractSlam
-from jaxslam.filters.linear.covariance import curvature
+from jaxslam.filters.linear.covariance import curvature, local_covariance
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.linalg import cholesky
 from jaxslam.models.motion import Control
@@ -130,7 +130,8 @@ def second_order(
     """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,
     *Estimation with Applications to Tracking and Navigation*, 2001, §10.3.2)."""
     context = context_of(slam, control)
-    hessian, Q = curvature(slam.model, state, slots, context)
+    hessian, local = curvature(slam.model, state, slots, context)
+    Q = local_covariance(state, local, slots)
     HQ = jnp.einsum("mpij,mjk->mpik", hessian, Q)
     return jnp.einsum("mpij,mqji->mpq", HQ, HQ) / 2
 

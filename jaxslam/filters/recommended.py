@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxslam.filters.linear.kalman import Kalman
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.slam import Piece, Slam
@@ -42,27 +43,36 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     size the unit observes, and the same sum, of 9 members: while the velocity is as unknown as the
     depths, the filter in metres is over-confident. Nothing has to be carried along the base frame.
 
-    For odometry, and for a sensor that measures metres (then of Cartesian points): the paper's
-    filter. What nothing observes is the base frame alone, whose directions do not move with a
-    robocentric estimate: a remedy has nothing to repair, and world-centric filters with one were
-    more over-confident.
+    For a camera with odometry it is the paper's filter, with the same common error of depths, and
+    an update of three steps of Gauss–Newton that ends at the mean of the posterior. Parallax is a
+    product of the displacement and 1/z: one linearisation is too sure of a new landmark's, and the
+    maximum of the posterior is at too long a displacement.
+
+    For a sensor that measures metres: the paper's filter, of Cartesian points. What nothing
+    observes is the base frame alone, whose directions do not move with a robocentric estimate: a
+    remedy has nothing to repair, and world-centric filters with one were more over-confident.
 
     Other `pieces` are those of `Slam`, and take the place of these. Raises ValueError.
     """
     planar = motion.geometry is PLANAR
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
-    chosen: dict[str, Piece] = {} if sensor.hidden else {"landmark": Cartesian()}
-    if motion.has_velocity and sensor.hidden:
-        told = _velocity_is_known(motion)
-        if depth.common is None:
-            depth = replace(depth, common=0.5, walk=0.03 if told else None)
-        chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}
-        chosen["correction"] = ObservabilityConstrained()
-        if not told:
+    learns, walk = True, 0.03
+    chosen: dict[str, Piece] = {}
+    if not sensor.hidden:
+        learns, chosen["landmark"] = False, Cartesian()
+    elif motion.has_velocity:
+        chosen["scale"], chosen["correction"] = ScaleGauge(), ObservabilityConstrained()
+        chosen["mixture"] = Mixture(17 if planar else 9)
+        if not _velocity_is_known(motion):
+            walk = None
             chosen["mixture"] = Mixture(5 if planar else 3)
             chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
-    elif motion.estimates_velocity and sensor.hidden:
-        chosen = {"scale": ScaleGauge(), "mixture": Mixture(9)}
+    elif motion.estimates_velocity:
+        learns, chosen["scale"], chosen["mixture"] = False, ScaleGauge(), Mixture(9)
+    else:
+        chosen["correction"] = Kalman(steps=3, mean=True)
+    if learns and depth.common is None:
+        depth = replace(depth, common=0.5, walk=walk)
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.gate import Gate
@@ -58,10 +59,10 @@ def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
     return replace(slam, depth=replace(slam.depth, common=percent / 100))
 
 
-def _iterated(slam: Slam, steps: int = 5) -> Slam:
-    if not hasattr(slam.correction, "steps"):
-        raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton in an update")
-    return replace(slam, correction=replace(slam.correction, steps=steps))
+def _updated(slam: Slam, word: str, **fields: Any) -> Slam:
+    if not hasattr(slam.correction, next(iter(fields))):
+        raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton: no {word}")
+    return replace(slam, correction=replace(slam.correction, **fields))
 
 
 def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
@@ -81,7 +82,8 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "fej2": lambda slam: replace(slam, correction=ProjectedFirstEstimates()),
     "decoupled": lambda slam: replace(slam, correction=DecoupledInvariant()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
-    "iterated": _iterated,
+    "iterated": lambda slam, steps=5: _updated(slam, "iterated", steps=steps),
+    "mean": lambda slam: _updated(slam, "mean", mean=True),
     "drift": lambda slam, percent=10: replace(
         slam, correction=RandomWalk(slam.correction, percent / 100)
     ),
@@ -102,7 +104,7 @@ recommended mixture. The number that may follow the name is
 - `walk`: σ by which that error, which it needs, changes from frame to frame, in percent of the
   same;
 - `fej`, `fej2`, `decoupled`: none;
-- `oc`, `iterated`: the steps of Gauss–Newton in an update;
+- `oc`, `iterated`: the steps of Gauss–Newton in an update; `mean`: none;
 - `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;
 - `directions`: the members of a Gaussian sum; `mixture`: the most members of one that is split;
 - `rest`: the frames of the longest window of a start;

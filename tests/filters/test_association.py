@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from jaxslam.filters import association
 from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidates
 from jaxslam.filters.gaussian import context_of
-from jaxslam.filters.linear.covariance import curvature
+from jaxslam.filters.linear.covariance import curvature, local_covariance
 from jaxslam.filters.mixture.split_merge import _root_of_cost
 from jaxslam.filters.model import COMPOSED
 from jaxslam.models.observations import Features
@@ -236,7 +236,8 @@ def test_the_spread_of_a_curved_measurement_is_by_second_derivatives():
         seen = Features(jnp.arange(6), pixels, jnp.ones(6, bool))
         more, less = (candidates(slam, state, control, seen, curved=x) for x in (True, False))
         added = more.covariance - less.covariance
-        return *curvature(slam.model, state, jnp.arange(6), at), measured(steps), added
+        hessian, local = curvature(slam.model, state, jnp.arange(6), at)
+        return hessian, local_covariance(state, local, jnp.arange(6)), measured(steps), added
 
     d, c = state.landmarks.shape[1], state.core_dim
     sizes = 1e-3 * np.maximum(1.0, np.abs(np.asarray(state.landmarks[k])))

@@ -18,7 +18,7 @@ SOME = ["world", "keyframe", "scale_gauge+oc+scene50", "invariant", "robocentric
 """Of which those laws are, that need no other program than the batch of all lanes."""
 OTHERS = [
     "scale_gauge+mixture3", "world+fej", "world+fej2", "world+decoupled", "world+oc",
-    "robocentric+iterated3", "robocentric+drift", "robocentric+checked",
+    "robocentric+iterated3+mean", "robocentric+drift", "robocentric+checked",
     "scale_gauge+directions3", "scale_gauge+mixture3+rest4",
     "world+particles", "robocentric+rays", "robocentric+nodes", "recommended",
 ]  # fmt: skip

@@ -331,7 +331,7 @@ def test_longer_sums_and_loops_are_no_longer_programs(monkeypatch):
 
 WORDS = (
     "scale_gauge+oc", "recommended+mixture3", "robocentric", "world", "keyframe", "scale_gauge",
-    "invariant", "recommended", "world+fej", "robocentric+iterated3", "robocentric+drift",
+    "invariant", "recommended", "world+fej", "robocentric+iterated3+mean", "robocentric+drift",
     "robocentric+scene50",
     "scale_gauge+scene50+walk3", "scale_gauge+directions3", "recommended+submaps",
     "robocentric+checked", "recommended+rest4", "robocentric+particles3", "robocentric+rays3",

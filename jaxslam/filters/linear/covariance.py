@@ -203,9 +203,9 @@ def joint_covariance(state: State, slot: Int[Array, ""]) -> Float[Array, "k k"]:
 
 def curvature(
     model: Model, state: State, slots: Slots, context: PyTree
-) -> tuple[Float[Array, "m p k k"], Float[Array, "m k k"]]:
+) -> tuple[Float[Array, "m p k k"], Blocks]:
     """Second derivatives of every landmark's measurement by what it depends on, the view and the
-    landmark's own numbers, and the covariance of these."""
+    landmark's own numbers, and the Jacobian of these by the state."""
     context = model.given(state.core, context)
     view = model.view(state.core, context)
     view_by_core = jacobian(lambda core: model.view(core, context), state.core)
@@ -217,5 +217,4 @@ def curvature(
     zero = jnp.zeros(v + d, state.landmarks.dtype)
     hessian = jax.vmap(lambda landmark: jax.jacfwd(jax.jacfwd(measured))(zero, landmark))
     eye = jnp.broadcast_to(jnp.eye(v + d, dtype=zero.dtype), (m, v + d, v + d))
-    itself = Blocks(view_by_core, eye[:, :, :v], eye[:, :, v:])
-    return hessian(state.landmarks[slots]), local_covariance(state, itself, slots)
+    return hessian(state.landmarks[slots]), Blocks(view_by_core, eye[:, :, :v], eye[:, :, v:])
