@@ -3,7 +3,8 @@
     python benchmarks/long_runs.py
 
 What a filter takes for the depth of new landmarks is right in `laps-prior`, wrong in `laps-thrown`,
-and becomes wrong half way in `laps-change`. Results are added to `long_runs.json` one filter at a
+and becomes wrong half way in `laps-change`; the same of a camera with odometry, which is on a ring
+in `laps`, too. Results are added to `long_runs.json` one filter at a
 time; what it has, of as many runs, is not run again. `docs/long-runs.png` is drawn from it, by
 `--page` alone from what is there.
 """
@@ -29,6 +30,12 @@ WORLDS = {
     "laps-change": "depths change half way",
 }
 """Scenarios, and what is drawn above them."""
+ODOMETRY = {
+    "motion": "odometry", "rate": 10.0, "odometry_sigma": [0.005, 0.005, 0.000873],
+}  # fmt: skip
+"""Settings of a camera with odometry: 5 mm and 0.05° over steps of 12 cm."""
+WITH_ODOMETRY = " with odometry"
+"""What stands behind the name of such a world in the results."""
 FIRST, MOST = 10, 60
 """The first step of which numbers are kept, and how many steps, at even ratios."""
 CUT = 1e5
@@ -44,6 +51,10 @@ class LongRuns(OfRuns):
     scenarios: tuple[str, ...] = tuple(WORLDS)
     filters: tuple[str, ...] = ("robocentric", "world+oc", "scale_gauge+oc+scene50", "recommended")
     """Filters, with modifiers, of Inverse Scaling."""
+    with_odometry: tuple[str, ...] = (*WORLDS, "laps")
+    """Scenarios of a camera with odometry."""
+    for_odometry: tuple[str, ...] = ("robocentric", "recommended")
+    """Filters of it."""
     runs: int = 48
     steps: int = 3000
     seed: int = 20261128
@@ -52,10 +63,17 @@ class LongRuns(OfRuns):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         """`[scenario][filter]`: mean and median NEES and the share of lost runs `at` some steps."""
-        yield from self.each(self._measured, self.scenarios, self.filters, steps=self.steps)
+        of_odometry = [world + WITH_ODOMETRY for world in self.with_odometry]
+        for worlds, names in (
+            (self.scenarios, self.filters),
+            (of_odometry, self.for_odometry),
+        ):
+            yield from self.each(self._measured, worlds, names, steps=self.steps)
 
     def _measured(self, scenario: str, name: str) -> dict[str, Any]:
-        world = jaxslam.scenario(scenario, {"steps": self.steps})
+        settings = ODOMETRY if scenario.endswith(WITH_ODOMETRY) else {}
+        settings = {**settings, "steps": self.steps}
+        world = jaxslam.scenario(scenario.removesuffix(WITH_ODOMETRY), settings)
         _, found = self.study(world, name)
         at = np.unique(np.geomspace(FIRST, self.steps, MOST).round().astype(int)).tolist()
         kept = {key: [found[key][k - 1] for k in at] for key in ("nees", "nees_median", "lost")}
@@ -67,7 +85,8 @@ class LongRuns(OfRuns):
 
 
 def drawn_of(results: dict[str, Any]) -> Figure:
-    """Mean NEES against the step, a panel for every scenario."""
+    """Mean NEES against the step, a panel for every scenario without odometry."""
+    results = {name: row for name, row in results.items() if name in WORLDS}
     figure = new_figure(3.4 * len(results), 3.2)
     axes = np.atleast_1d(figure.subplots(1, len(results), sharey=True))
     for ax, (scenario, filters) in zip(axes, results.items(), strict=True):

@@ -61,7 +61,7 @@ def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
 
 def _updated(slam: Slam, word: str, **fields: Any) -> Slam:
     if not hasattr(slam.correction, next(iter(fields))):
-        raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton: no {word}")
+        raise ValueError(f"{word} does not go with {slam.correction.name}")
     return replace(slam, correction=replace(slam.correction, **fields))
 
 

@@ -33,6 +33,7 @@ def test_the_mean_is_drawn_of_every_filter():
 def test_numbers_are_kept_of_some_steps(tmp_path):
     """Numbers of another step than the one that they are said to be of."""
     few: dict[str, Any] = {"scenarios": ("laps-thrown",), "filters": ("robocentric",), "steps": 12}
+    few["with_odometry"] = ()
     long_runs.LongRuns(**few, runs=2, chunk=2, out=tmp_path / "x.json", docs=tmp_path)()
     row = json.loads((tmp_path / "x.json").read_text())["laps-thrown"]["robocentric"]
     assert row["at"] == [10, 11, 12]

@@ -33,14 +33,11 @@ class ObservabilityConstrained(AbstractCorrection):
     """Steps of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first,
     as it does for a large acceleration, the first would be wrong, and carried on."""
 
-    mean: bool = eqx.field(static=True, default=False)
-    """Whether the estimate then moves from the maximum to the mean."""
-
     def __check_init__(self) -> None:
         check_steps(self.steps)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
-        data = features, noise, context, considered, self.mean
+        data = features, noise, context, considered
         return gauss_newton(model, state, self.steps, partial(follow, model), *data)
 
 
