@@ -126,7 +126,8 @@ def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) 
     ax.barh(places, shares, color=COLOURS[0], label=label)
     for place, share in zip(places, shares, strict=True):
         beyond = max(share, 100 * OUTSIDE)  # where the grey line hides no digit
-        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=LETTERS)
+        written = f"  {float(f'{share:.2g}'):g} %"  # 100, not 1e+02
+        ax.annotate(written, (beyond, place), va="center", fontsize=LETTERS)
     ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
     ax.set_yticks(places, evaluation.names[:_WIDEST])
     ax.invert_yaxis()

@@ -24,6 +24,7 @@ from jaxslam.plots.consistency import (
     plot_outside,
 )
 from jaxslam.plots.evaluation import plot_evaluation
+from jaxslam.plots.evaluation import plot_outside as plot_shares
 from jaxslam.plots.style import (
     COLUMN,
     End,
@@ -96,6 +97,7 @@ def test_a_line_that_breaks_off_is_named_at_its_last_number_and_one_without_any_
         (0.9, 300, ["1", "2", "5", "10", "20", "50", "100", "200"]),
         (0.002, 0.011, ["0.002", "0.003", "0.005", "0.01"]),
         (0.5, 5000, ["1", "10", "100", "1000"]),
+        (0.0012, 0.0019, ["0.0012", "0.0014", "0.0016", "0.0018"]),
     ],
 )
 def test_ticks_are_round_numbers_written_out(low, high, told):
@@ -107,6 +109,14 @@ def test_ticks_are_round_numbers_written_out(low, high, told):
     figure.draw_without_rendering()
     ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
     assert [label.get_text() for value, label in ticks if low <= value <= high][: len(told)] == told
+
+
+@pytest.mark.parametrize(("wrong", "said"), [(1000.0, "100 %"), (0.001, "0 %")])
+def test_shares_of_errors_are_written_out(wrong, said):
+    errors = wrong * (1.0 + np.arange(200.0).reshape(20, 5, 2))  # beyond 3 σ, or all inside
+    found = jaxslam.evaluate(errors, np.broadcast_to(np.eye(2), (20, 5, 2, 2)))
+    axes = plot_shares(found, ax=new_figure(4, 3).subplots())
+    assert [text.get_text().strip() for text in axes.texts] == [said, said]
 
 
 def test_long_names_leave_most_of_a_column_to_the_lines(tmp_path):
