@@ -211,7 +211,7 @@ def _draw_landmarks(axis: Axes, panel: _Panel, points: Positions, covariances: S
     points, covariances = panel.seen(points, covariances)
     shown = 2 * _SIGMAS_95 * np.sqrt(np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
     draw_ellipses(axis, points[shown], covariances[shown], _SIGMAS_95, _LANDMARKS)
-    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
+    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmark; ellipse: 95 %, in its map")
     return int((~shown).sum())
 
 
@@ -226,4 +226,4 @@ def _draw_begun(axis: Axes, panel: _Panel, places: Positions, covariances: Sprea
     """Mark where maps begin, and where in the world that can be."""
     places, covariances = panel.seen(places, covariances)
     draw_ellipses(axis, places, covariances, _SIGMAS_95, _BEGUN)
-    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins, 95 % of where")
+    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins; ellipse: 95 %")
