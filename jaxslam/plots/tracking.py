@@ -142,14 +142,16 @@ def _lines(
 def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Panel]]]:
     """Two panels, one above the other: from above and from behind, x to the right; of what is
     deeper than wide from above and from the side, z to the right. Over them the path alone, where
-    it is small."""
-    across, _, deep = everything[1] - everything[0]
-    above, upright = ([2, 0], [2, 1]) if deep > across else ([0, 2], [0, 1])
-    panels = [
-        _Panel("from above", above, everything),
-        _Panel("from the side" if deep > across else "from behind", upright, everything),
-    ]
-    alone = _Panel("the path, from above", above, path, with_landmarks=False)
+    it is small, its own longer side to the right."""
+
+    def from_above(box: _Box) -> list[int]:
+        across, _, deep = box[1] - box[0]
+        return [2, 0] if deep > across else [0, 2]
+
+    above = from_above(everything)
+    aside = _Panel("from the side" if above[0] else "from behind", [above[0], 1], everything)
+    panels = [_Panel("from above", above, everything), aside]
+    alone = _Panel("the path, from above", from_above(path), path, with_landmarks=False)
     if alone.size < 0.5 * panels[0].size:
         panels.insert(0, alone)
     heights = [panel.height for panel in panels]

@@ -89,8 +89,10 @@ def test_what_is_longer_lies_to_the_right_in_equal_axes(width, titles):
 def test_a_path_that_is_small_in_its_map_is_shown_alone_too():
     axes = drawn(path_along_x(length=0.2), *wall())
     assert list(axes) == ["the path, from above", "from above", "from the side"]
-    low, high = axes["the path, from above"].get_ylim()[::-1]
-    assert (low, high) == pytest.approx((-0.012, 0.212))
+    alone = axes["the path, from above"]
+    assert (alone.get_xlabel(), alone.get_ylabel()) == ("x (m)", "z (m)")
+    assert alone.get_xlim() == pytest.approx((-0.012, 0.212))
+    assert not alone.yaxis_inverted()
     low, high = axes["from above"].get_xlim()
     assert high > 4
 
