@@ -212,6 +212,16 @@ def test_the_first_picture_of_the_site_is_as_the_program_draws_it_now(study):
     assert shown | {"title": ""} == now | {"title": ""}
 
 
+def test_the_map_of_a_run_fills_its_place_with_equal_units_and_warns_of_nothing(study, caplog):
+    figure = plot_consistency(study)
+    figure.draw_without_rendering()
+    (map_,) = (ax for ax in figure.axes if ax.get_xlabel() == "x, m")
+    place, (left, right), (low, high) = map_.get_window_extent(), map_.get_xlim(), map_.get_ylim()
+    assert place.width > 1.3 * place.height  # as wide as the axes beside it
+    assert place.width / (right - left) == pytest.approx(place.height / (high - low), rel=1e-3)
+    assert not caplog.records
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
     ax = new_figure(3, 3).subplots()
