@@ -165,6 +165,7 @@ def _set_axes(axis: Axes, panel: _Panel, unit: str) -> None:
     across, up = ("xyz"[i] for i in panel.plane)
     axis.set(xlabel=f"{across} ({unit})", ylabel=f"{up} ({unit})", aspect="equal")
     axis.set(xlim=(left, right), ylim=(bottom, top))
+    axis.locator_params(axis="x", nbins=6)  # numbers of three decimals side by side
     axis.grid(alpha=0.25, lw=0.5)
     if panel.plane != [0, 2]:  # y points down, and so does x where z points to the right
         axis.invert_yaxis()
