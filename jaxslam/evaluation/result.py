@@ -506,7 +506,7 @@ def _run(evaluation: Evaluation, run: int) -> str:
 
 
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    errors = "RMSE" if evaluation.convention is None else "RMSE, m or rad"
+    errors = "RMSE, m or rad" if evaluation.convention and not evaluation.scale else "RMSE"
     return [
         ("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
         *(_row(evaluation, i) for i in range(len(evaluation.names))),

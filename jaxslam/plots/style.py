@@ -141,10 +141,8 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     """
     ends = [end for end in ends if np.isfinite(end.y).any()]
     longest = max((len(end.label) for end in ends), default=0)
-    room = axes.figure.bbox.width / axes.figure.dpi
-    # In sizes of the letters, about.
-    # The share of a figure's width that names at lines may take.
-    if longest * 0.55 * LETTERS / 72 > 0.3 * room:
+    # Of about half their height each, letters may take such a share of the figure's width.
+    if longest * 0.55 * LETTERS / 72 > 0.3 * axes.figure.bbox.width / axes.figure.dpi:
         lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
         # Inches from the axes to what stands below the numbers and the name of x.
         below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=-0.42, units="inches")

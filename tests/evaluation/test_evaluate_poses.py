@@ -47,7 +47,7 @@ from jaxslam.evaluation.poses import estimated, with_truth
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
-from jaxslam.plots.evaluation import plot_axis, plot_evaluation
+from jaxslam.plots.evaluation import plot_axis, plot_evaluation, plot_scale
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Tally, not_disproved, run_verdict
 from jaxslam.statistics.beyond_scale import one_scale
@@ -313,6 +313,12 @@ def test_a_drift_of_scale_is_over_confident_and_named():
     assert drift[-2] - drift[2] == pytest.approx(np.log(4) * 35 / 39, rel=0.05)
     panels = [axes.get_title() for axes in plot_evaluation(found).axes]
     assert sum(title.startswith("scale") for title in panels) == 1
+    assert found.scale is not None
+    steady = replace(found.scale, drift=0.001 * found.scale.drift)
+    axes = plot_scale(replace(found, scale=steady), ax=new_figure(4, 3).subplots())
+    low, high = axes.get_ylim()  # what is claimed is shown where no scale drifts
+    claimed = [np.nanmedian(np.abs(line.get_ydata())) for line in axes.lines[-2:]]
+    assert low < -max(claimed) < max(claimed) < high
 
 
 @pytest.mark.parametrize(("factor", "disproved"), [(0.3, False), (3.0, True)])
