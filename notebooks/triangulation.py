@@ -244,7 +244,7 @@ for calibration in CALIBRATIONS:
 #   is shared or known, and mostly where it is not. Against triangulation not always: the prior is
 #   then an error, and the Cartesian Gaussian makes none.
 # - **UID better than the Cartesian Gaussian**: against the posterior mostly, but seldom where the
-#   calibration is shared; against triangulation in half of the settings or fewer.
+#   calibration is shared; against triangulation in about half of the settings or fewer.
 #
 # So the paper's statement is not true of the paper's own model of the calibration. It is true, and
 # more so than stated, of a camera whose intrinsics are constant: there UID fails and IS does not.
