@@ -146,7 +146,8 @@ def plot_axis(
         label_end(ax, End(label, evaluation.times, rmse, colour))
     ax.set_ylim(bottom=0)
     if evaluation.convention is not None:
-        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
+        length = "m" if evaluation.scale is None else "map units"
+        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else length)
     set_title(ax, f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)")
     return _over_time(evaluation, ax)
 

@@ -108,7 +108,7 @@ def name_numbers(axis: Axis) -> None:
     named = [d * 10.0**power for power in _POWERS for d in digits]
     # Fewer than three do not say how fast a short axis grows.
     if sum(low <= number <= high for number in named) < 3:
-        named = MaxNLocator(4).tick_values(low, high).tolist()
+        named = list(MaxNLocator(4).tick_values(low, high))
     axis.set_major_locator(FixedLocator(named))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(NullFormatter())

@@ -271,7 +271,7 @@ def test_of_the_axes_used_alone_a_folder_is_evaluated_and_drawn(tmp_path):
     assert found.names == ("x", "rz")
     axes = new_figure(4, 3).subplots()
     labels = [plot_axis(found, axis, ax=axes).get_ylabel() for axis in (0, 1)]
-    assert labels == ["m, or map units", "rad"]
+    assert labels == ["m", "rad"]
 
 
 @pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])
@@ -317,6 +317,7 @@ def test_a_drift_of_scale_is_over_confident_and_named():
     steady = replace(found.scale, drift=0.001 * found.scale.drift)
     axes = plot_scale(replace(found, scale=steady), ax=new_figure(4, 3).subplots())
     low, high = axes.get_ylim()  # what is claimed is shown where no scale drifts
+    assert plot_axis(found, 0, ax=new_figure(4, 3).subplots()).get_ylabel() == "map units"
     claimed = [np.nanmedian(np.abs(line.get_ydata())) for line in axes.lines[-2:]]
     assert low < -max(claimed) < max(claimed) < high
 
