@@ -22,6 +22,7 @@ html_static_path = html_css_files = ["site.css"]
 
 # Notebooks are executed before they are committed, and again, short, by .ci/run.
 nb_execution_mode = "off"
+nb_merge_streams = True  # a table that was printed line by line is one
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 suppress_warnings = [

@@ -85,9 +85,9 @@ for axes, (name, (path, (means, covariances), draws)) in zip(
 ):
     colour = COLOUR[name]
     axes.plot(*draws.reshape(-1, 2).T, ",", color=colour, alpha=0.5, rasterized=True)
-    draw_ellipses(axes, means, covariances, np.sqrt(chi2_quantile(0.95, 2)), colour)
-    axes.plot([], [], ".", color=colour, label=f"{NAME[name]}: draws")
-    axes.plot([], [], color=colour, lw=1, label=f"{NAME[name]}: 95 % ellipse to first order")
+    draw_ellipses(axes, means, covariances, np.sqrt(chi2_quantile(0.95, 2)), "#000000")
+    axes.plot([], [], ".", color=colour, label="draws from the Gaussian")
+    axes.plot([], [], color="k", lw=0.7, alpha=0.6, label="95 % ellipse to first order")
     axes.plot(*true_points.T, "k+", ms=9, mew=1.5, label="true landmarks")
     axes.plot(*true_path.T, "k", lw=1, label="true path")
     axes.plot(*path.T, color=COLOURS[2], lw=1.5, ls="--", label="estimated path")
@@ -205,7 +205,7 @@ for name, value in mean.items():
 
 # %% [markdown]
 # The gain of the paper's filter needs both. Robocentric IS is best. Without the robocentric frame,
-# IS is by far the worst: an uncertain point (x, y, z, ω) far from the origin of the world is turned
+# IS is by far the worst: an uncertain point (x, z, ω) far from the origin of the world is turned
 # and shifted by an uncertain pose only once, when it enters, and that linearisation is never
 # renewed. UID hardly cares about the frame, since its ray is anchored where it was first seen.
 #

@@ -184,7 +184,7 @@ for frame in FRAMES:
 # %% [markdown]
 # The EKF loses most of its runs, most of these in the first frames, by a coin that it never knew it
 # tossed. The sum says "left or right" while the pixels do not decide. Larger studies, planar and
-# in 6-DoF, and what still fails are in `docs/from-rest.md`.
+# in 6-DoF, and what still fails are in [docs/from-rest.md](../docs/from-rest.md).
 
 # %%
 assert np.abs(behind - seen).max() < 1e-9

@@ -142,7 +142,7 @@ axes.set(
 for axis, ticks in ((axes.xaxis, (0.3, 0.5, 1, 2, 4)), (axes.yaxis, (0.4, 0.6, 1, 1.6))):
     axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.set_ticks([], minor=True)
-axes.legend(loc="upper left")
+axes.legend(loc="lower left")
 plt.show()
 
 # %%

@@ -119,14 +119,15 @@ for axes, colour, (name, (centres, covariances, _)) in zip(
     figure.subplots(1, 2, sharex=True, sharey=True), COLOURS[1::-1], told.items(), strict=True
 ):
     axes.plot(*path.T, "k", lw=1, label="true path")
-    axes.plot(*path[frames].T, "k.", ms=5, label="true camera where a submap ends")
+    axes.plot(*path[frames].T, "k.", ms=5, label="true camera")
     drawn = path[frames] + LARGER * (centres - path[frames])
-    axes.plot(*drawn.T, "+", color=colour, ms=9, label=f"estimated camera, error × {LARGER}")
+    axes.plot(*drawn.T, "+", color=colour, ms=9, label=f"estimate, error × {LARGER}")
     for i, (centre, covariance) in enumerate(zip(drawn, covariances, strict=True)):
         outline = centre[:, None] + LARGER * ellipse(covariance)
         axes.plot(*outline, color=colour, lw=1, label=None if i else f"95 % ellipse × {LARGER}")
     axes.set(aspect="equal", xlabel="x, m", ylabel="z, m", title=name)
-    axes.legend(fontsize=8, loc="center")
+    within = {"bbox_to_anchor": (-4.0, 0.4), "bbox_transform": axes.transData}
+    axes.legend(fontsize=8, loc="center", **within)
     axes.grid(alpha=0.25)
 display(figure)
 
@@ -134,8 +135,8 @@ display(figure)
 # ## Is it believable?
 #
 # The error of each of these cameras beside the σ that the chain claims of it. A loop makes both
-# smaller, and NEES, which is 1 by its degrees of freedom for a right covariance, says whether
-# both by the same factor.
+# smaller, and NEES per degree of freedom, which is 1 for a right covariance, says whether both by
+# the same factor.
 
 # %%
 figure = new_figure(10, 4)
@@ -153,7 +154,7 @@ axes.grid(alpha=0.25)
 display(figure)
 for name, (centres, _, nees) in told.items():
     rms = np.sqrt(np.mean(np.sum((centres - path[frames]) ** 2, axis=1)))
-    print(f"{name}: RMS error {rms:.3f} m, mean NEES {nees.mean():.2f} by its degrees of freedom")
+    print(f"{name}: RMS error {rms:.3f} m, mean NEES per degree of freedom {nees.mean():.2f}")
 
 # %% [markdown]
 # One run shows what happens. Whether the covariances hold is a matter of many:

@@ -197,13 +197,13 @@ figure = new_figure(11, 3.6)
 left, right = figure.subplots(1, 2)
 for colour, (name, (differences, _)) in zip(COLOURS, results.items(), strict=False):
     left.semilogy(differences.max(axis=1) + 1e-17, color=colour, label=name)
-left.axhline(1e-9, color="k", lw=0.8, ls="--")
+left.axhline(1e-9, color="k", lw=0.8, ls="--", label="largest that is allowed below")
 left.set(xlabel="frame", ylabel="largest difference, σ", title="NumPy beside the library")
 left.legend(fontsize=8)
 error, sigma = results["circle"][1].T
 right.plot(error, color=COLOURS[0])
 right.plot(3 * sigma, "k--", -3 * sigma, "k--", lw=0.8)
-right.set(xlabel="frame", ylabel="m", title="circle: error of the position in x with ±3σ")
+right.set(xlabel="frame", ylabel="error, m", title="circle: position in x with ±3σ (dashed)")
 display(figure)
 
 # %%

@@ -62,6 +62,7 @@ def plot(results):
 
 
 def table(results):
+    print("At the last step; others: the runs that are not lost")
     for name, r in results.items():
         rmse, sigma = r["rmse"]["position"][-1], r["sigma"]["position"][-1]
         print(
@@ -97,8 +98,8 @@ display(plot(sideways))
 table(sideways)
 
 # %% [markdown]
-# The error hardly changes. What changes is what the filter says of it: σ/RMSE goes from about
-# half to nearly one.
+# The curves of `+oc` and of `scale_gauge` lie on one another. The error hardly changes. What
+# changes is what the filter says of it: σ/RMSE goes from about half to nearly one.
 
 # %%
 low, high = jaxslam.mean_band(3, RUNS, confidence=0.9999)
@@ -144,9 +145,9 @@ for name in (SUM, RECOMMENDED):
 # Straight ahead the *maximum* of the posterior is not its mean: an inverse depth that
 # multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
 # larger amplitudes. The sum goes to the mean: five frames in, it is nearly the exact posterior
-# (0.07 nats from it, where the plain filter is 0.85; `docs/repairs.md`), at some twenty times
-# the cost of the plain filter. Later a few runs in a thousand are still lost, and one of
-# them is enough to take a mean NEES out of its band; and where accelerations are very large, it
-# is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that
-# believes it is consistent; `+scene50` learns how far away the landmarks are. Measured tables are
-# in `docs/consistency.md`.
+# (0.07 nats from it, where the plain filter is 0.85; [docs/repairs.md](../docs/repairs.md)), at
+# some twenty times the cost of the plain filter. Later about one run in a hundred is still lost,
+# and one of them is enough to take a mean NEES out of its band; and where accelerations are very
+# large, it is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter
+# that believes it is consistent; `+scene50` learns how far away the landmarks are. Measured tables
+# are in [docs/consistency.md](../docs/consistency.md).

@@ -237,12 +237,14 @@ for calibration in CALIBRATIONS:
 
 # %% [markdown]
 # - **IS at least as good as UID**: always, where the calibration is shared or known. Where each
-#   view draws its own, in about half of the settings only; on the axis wherever $d_{min} \ge 5 b$,
-#   since what $\delta f$ does at the prior's disparity is then small beside the other noise.
+#   view draws its own, in half to three quarters of the settings; on the axis wherever
+#   $d_{min} \ge 5 b$, since what $\delta f$ does at the prior's disparity is then small beside the
+#   other noise.
 # - **IS better than the Cartesian Gaussian**: against the posterior always, where the calibration
 #   is shared or known, and mostly where it is not. Against triangulation not always: the prior is
 #   then an error, and the Cartesian Gaussian makes none.
-# - **UID better than the Cartesian Gaussian**: mostly, but seldom where the calibration is shared.
+# - **UID better than the Cartesian Gaussian**: against the posterior mostly, but seldom where the
+#   calibration is shared; against triangulation in about half of the settings or fewer.
 #
 # So the paper's statement is not true of the paper's own model of the calibration. It is true, and
 # more so than stated, of a camera whose intrinsics are constant: there UID fails and IS does not.

@@ -49,14 +49,14 @@ for name, settings in SETTINGS.items():
     source = open_source(Path(VIDEO)) if VIDEO else synthetic_source(frames=FRAMES, seed=0)
     summaries[name] = track(source, out / name, settings)
     treatment = summaries[name]["calibration"]["treatment"]
-    print(f"{name} ({settings.filter}/{settings.landmarks}, calibration {treatment})")
+    print(f"{name} ({summaries[name]['filter']}, calibration {treatment})")
     print(describe(summaries[name]), "\n")
 
 # %% [markdown]
 # ## Frames
 #
-# A cross is a predicted position, its ellipse three standard deviations of the innovation: the
-# match is searched inside of it and nowhere else. Each filter's video is `overlay.mp4`.
+# An ellipse is three standard deviations of the innovation, around the predicted position: the
+# match, a dot, is searched inside of it and nowhere else. Each filter's video is `overlay.mp4`.
 
 
 # %%

@@ -1,12 +1,14 @@
 """The pages hang together: each is in the site, each link goes somewhere, versions agree."""
 
 import ast
+import json
 import re
 import sys
 import tomllib
 from datetime import date
 from pathlib import Path
 
+import jupytext
 import pytest
 from test_house import ORDER
 
@@ -14,6 +16,7 @@ import jaxslam
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
 
 
@@ -53,7 +56,18 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path):
 def test_every_page_and_notebook_is_in_the_site():
     listed = set((ROOT / "docs" / "index.md").read_text().split())
     assert {page.stem for page in PAGES} - {"index"} <= listed
-    assert {f"tutorials/{path.stem}" for path in (ROOT / "notebooks").glob("*.py")} <= listed
+    assert {f"tutorials/{path.stem}" for path in NOTEBOOKS} <= listed
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
+def test_an_executed_notebook_is_its_source_with_outputs_and_no_warning(source):
+    cells = json.loads(source.with_suffix(".ipynb").read_text())["cells"]
+    told = [("".join(cell["source"]), cell["cell_type"]) for cell in cells]
+    assert told == [(cell.source, cell.cell_type) for cell in jupytext.read(source).cells]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert not [x for x in outputs if x["output_type"] == "error" or x.get("name") == "stderr"]
 
 
 def test_every_room_is_in_the_site():

@@ -102,11 +102,11 @@ def read(place: Place) -> Log:
     log = ros.read_poses(place) if isinstance(place, ros.Topic) else read_log(place)
     back = log.times < np.maximum.accumulate(log.times)
     if 0 < back.sum() <= BACK * len(back):
-        log = _of_rows(log, ~back, f"{back.sum()} stamps go back in time, and are left out")
+        log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
     last = _last_of_each(log.times)
     doubled = len(log.times) - len(last)
-    told = f"{doubled} stamps are doubled; of each the last pose is used"
+    told = f"stamps that are doubled: {doubled}; of each the last pose is used"
     return _of_rows(log, last, told) if doubled else log
 
 

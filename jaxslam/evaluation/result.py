@@ -506,8 +506,9 @@ def _run(evaluation: Evaluation, run: int) -> str:
 
 
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    errors = "RMSE, m or rad" if evaluation.convention and not evaluation.scale else "RMSE"
     return [
-        ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
+        ("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
         *(_row(evaluation, i) for i in range(len(evaluation.names))),
         ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
     ]

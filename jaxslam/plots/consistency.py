@@ -280,7 +280,7 @@ def _plot_map(axes: Axes, samples: Mapping[str, Mapping[str, np.ndarray]]) -> No
     _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
     axes.set(xlabel="x, m", ylabel="z, m")
     # Said in the title: a legend would hide landmarks and ticks of a narrow map.
-    axes.set_title("run 0 from above,\n95 % regions\nblack: the truth", fontsize=9)
+    set_title(axes, "run 0 from above, 95 % regions\nblack: the truth")
     axes.grid(alpha=0.25)
 
 
@@ -290,5 +290,6 @@ def _set_view(axes: Axes, path: np.ndarray, points: np.ndarray) -> None:
     near = np.concatenate([path, points[distance <= 2.5 * np.median(distance)]])
     margin = 0.12 * np.ptp(near, axis=0).max()
     x, y = np.stack([near.min(axis=0) - margin, near.max(axis=0) + margin], axis=1)
-    axes.set(xlim=x, ylim=y)
-    axes.set_aspect("equal", adjustable="box")
+    # Free to grow to where the axes have room, without a warning.
+    axes.set(xlim=x, ylim=y, autoscale_on=True)
+    axes.set_aspect("equal", adjustable="datalim")

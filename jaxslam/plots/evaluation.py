@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxslam.evaluation import Evaluation
 from jaxslam.evaluation.result import OUTSIDE
@@ -68,10 +69,7 @@ def _page(evaluation: Evaluation) -> Figure:
     plot_outside(evaluation, ax=figure.add_subplot(grid[0, 2]))
     for panel in range(panels):
         ax = figure.add_subplot(grid[1 + panel // _PER_ROW, panel % _PER_ROW])
-        if panel < axes:
-            plot_axis(evaluation, panel, ax=ax)
-        else:
-            plot_scale(evaluation, ax=ax)
+        _ = plot_axis(evaluation, panel, ax=ax) if panel < axes else plot_scale(evaluation, ax=ax)
     return figure
 
 
@@ -126,7 +124,8 @@ def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) 
     ax.barh(places, shares, color=COLOURS[0], label=label)
     for place, share in zip(places, shares, strict=True):
         beyond = max(share, 100 * OUTSIDE)  # where the grey line hides no digit
-        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=LETTERS)
+        written = f"  {float(f'{share:.2g}'):g} %"  # 100, not 1e+02
+        ax.annotate(written, (beyond, place), va="center", fontsize=LETTERS)
     ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
     ax.set_yticks(places, evaluation.names[:_WIDEST])
     ax.invert_yaxis()
@@ -147,7 +146,8 @@ def plot_axis(
         label_end(ax, End(label, evaluation.times, rmse, colour))
     ax.set_ylim(bottom=0)
     if evaluation.convention is not None:
-        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
+        length = "m" if evaluation.scale is None else "map units"
+        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else length)
     set_title(ax, f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)")
     return _over_time(evaluation, ax)
 
@@ -167,10 +167,10 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
     ax.plot(evaluation.times, percent[1], lw=1.8, color=COLOURS[0], marker=marker)
     if label is not None:
         label_end(ax, End(label, evaluation.times, percent[1], COLOURS[0]))
-    for sign in (-2, 2):
-        claimed = 100 * np.expm1(np.clip(sign * sigma, -_MOST_LOG, _MOST_LOG))
-        ax.plot(evaluation.times, claimed, lw=1.4, ls="--", color=COLOURS[1])
-    largest = np.nanquantile(np.abs(percent), 0.9) if np.isfinite(percent).any() else 1.0
+    claimed = 100 * np.expm1(np.clip([-2 * sigma, 2 * sigma], -_MOST_LOG, _MOST_LOG))
+    ax.plot(evaluation.times, claimed.T, lw=1.4, ls="--", color=COLOURS[1])
+    shown = np.abs([*percent, *claimed])
+    largest = np.nanquantile(shown, 0.9) if np.isfinite(shown).any() else 1.0
     ax.set_ylim(-1.6 * largest - 1e-9, 1.6 * largest + 1e-9)
     ax.set_ylabel("% off its run's")
     set_title(ax, "scale: median, 95 % of runs; ±2σ claimed (dashed)")
@@ -180,5 +180,10 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
 def _over_time(evaluation: Evaluation, ax: Axes) -> Axes:
     ax.margins(x=0)
     ax.set_xlabel("time, s" if evaluation.timed else "step")
+    first, last = evaluation.times[[0, -1]]
+    if evaluation.timed and first > 1e8:  # s: stamps of a clock, as those since 1970
+        ticks = MaxNLocator(6).tick_values(0, last - first)[:-1]  # the last is at the end or beyond
+        ax.set_xticks(first + ticks, [f"{tick:g}" for tick in ticks])
+        ax.set_xlabel("time from the first pose, s")
     ax.grid(alpha=0.25)
     return ax

@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import FixedLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 from scipy.optimize import isotonic_regression
 
@@ -105,7 +105,11 @@ def name_numbers(axis: Axis) -> None:
     """Name the round numbers of a logarithmic axis, as many as its length bears, as they are."""
     low, high = sorted(axis.get_view_interval())
     digits = next(digits for most, digits in _DIGITS if high <= most * low)
-    axis.set_major_locator(FixedLocator([d * 10.0**power for power in _POWERS for d in digits]))
+    named = [d * 10.0**power for power in _POWERS for d in digits]
+    # Fewer than three do not say how fast a short axis grows.
+    if sum(low <= number <= high for number in named) < 3:
+        named = list(MaxNLocator(4).tick_values(low, high))
+    axis.set_major_locator(FixedLocator(named))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(NullFormatter())
 
@@ -137,10 +141,8 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     """
     ends = [end for end in ends if np.isfinite(end.y).any()]
     longest = max((len(end.label) for end in ends), default=0)
-    room = axes.figure.bbox.width / axes.figure.dpi
-    # In sizes of the letters, about.
-    # The share of a figure's width that names at lines may take.
-    if longest * 0.55 * LETTERS / 72 > 0.3 * room:
+    # Of about half their height each, letters may take such a share of the figure's width.
+    if longest * 0.55 * LETTERS / 72 > 0.3 * axes.figure.bbox.width / axes.figure.dpi:
         lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
         # Inches from the axes to what stands below the numbers and the name of x.
         below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=-0.42, units="inches")
@@ -156,19 +158,15 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
         return
     pixels = axes.transData.transform(points)
     heights = np.clip(axes.transAxes.inverted().transform(pixels)[:, 1], 0, 1)
-    # Height of a line of text, in sizes of its letters.
-    apart = 1.25 * LETTERS / 72 / _height(axes)
+    # Height of a line of text, in sizes of its letters, and about that of the axes, in inches, as
+    # the layout is made later.
+    apart = 1.25 * LETTERS / 72 / (0.85 * axes.bbox.height / axes.figure.dpi)
     for end, point, height in zip(ends, points, _apart(heights, apart), strict=True):
         axes.annotate(
             end.label, tuple(point), (1.02, height), textcoords=axes.transAxes, color=end.colour,
             fontsize=LETTERS, va="center", annotation_clip=False,
             arrowprops={"arrowstyle": "-", "color": end.colour, "lw": 0.5, "relpos": (0, 0.5)},
         )  # fmt: skip
-
-
-def _height(axes: Axes) -> float:
-    """About, in inches: the layout is made later."""
-    return 0.85 * axes.bbox.height / axes.figure.dpi
 
 
 def _apart(places: Float[np.ndarray, " n"], least: float) -> Float[np.ndarray, " n"]:

@@ -142,14 +142,16 @@ def _lines(
 def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Panel]]]:
     """Two panels, one above the other: from above and from behind, x to the right; of what is
     deeper than wide from above and from the side, z to the right. Over them the path alone, where
-    it is small."""
-    across, _, deep = everything[1] - everything[0]
-    above, upright = ([2, 0], [2, 1]) if deep > across else ([0, 2], [0, 1])
-    panels = [
-        _Panel("from above", above, everything),
-        _Panel("from the side" if deep > across else "from behind", upright, everything),
-    ]
-    alone = _Panel("the path, from above", above, path, with_landmarks=False)
+    it is small, its own longer side to the right."""
+
+    def from_above(box: _Box) -> list[int]:
+        across, _, deep = box[1] - box[0]
+        return [2, 0] if deep > across else [0, 2]
+
+    above = from_above(everything)
+    aside = _Panel("from the side" if above[0] else "from behind", [above[0], 1], everything)
+    panels = [_Panel("from above", above, everything), aside]
+    alone = _Panel("the path, from above", from_above(path), path, with_landmarks=False)
     if alone.size < 0.5 * panels[0].size:
         panels.insert(0, alone)
     heights = [panel.height for panel in panels]
@@ -163,6 +165,7 @@ def _set_axes(axis: Axes, panel: _Panel, unit: str) -> None:
     across, up = ("xyz"[i] for i in panel.plane)
     axis.set(xlabel=f"{across} ({unit})", ylabel=f"{up} ({unit})", aspect="equal")
     axis.set(xlim=(left, right), ylim=(bottom, top))
+    axis.locator_params(axis="x", nbins=6)  # numbers of three decimals side by side
     axis.grid(alpha=0.25, lw=0.5)
     if panel.plane != [0, 2]:  # y points down, and so does x where z points to the right
         axis.invert_yaxis()
@@ -211,7 +214,7 @@ def _draw_landmarks(axis: Axes, panel: _Panel, points: Positions, covariances: S
     points, covariances = panel.seen(points, covariances)
     shown = 2 * _SIGMAS_95 * np.sqrt(np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
     draw_ellipses(axis, points[shown], covariances[shown], _SIGMAS_95, _LANDMARKS)
-    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
+    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmark; ellipse: 95 %, in its map")
     return int((~shown).sum())
 
 
@@ -226,4 +229,4 @@ def _draw_begun(axis: Axes, panel: _Panel, places: Positions, covariances: Sprea
     """Mark where maps begin, and where in the world that can be."""
     places, covariances = panel.seen(places, covariances)
     draw_ellipses(axis, places, covariances, _SIGMAS_95, _BEGUN)
-    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins, 95 % of where")
+    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins; ellipse: 95 %")

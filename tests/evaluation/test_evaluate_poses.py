@@ -47,7 +47,7 @@ from jaxslam.evaluation.poses import estimated, with_truth
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
-from jaxslam.plots.evaluation import plot_axis, plot_evaluation
+from jaxslam.plots.evaluation import plot_axis, plot_evaluation, plot_scale
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Tally, not_disproved, run_verdict
 from jaxslam.statistics.beyond_scale import one_scale
@@ -271,7 +271,7 @@ def test_of_the_axes_used_alone_a_folder_is_evaluated_and_drawn(tmp_path):
     assert found.names == ("x", "rz")
     axes = new_figure(4, 3).subplots()
     labels = [plot_axis(found, axis, ax=axes).get_ylabel() for axis in (0, 1)]
-    assert labels == ["m, or map units", "rad"]
+    assert labels == ["m", "rad"]
 
 
 @pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])
@@ -313,6 +313,13 @@ def test_a_drift_of_scale_is_over_confident_and_named():
     assert drift[-2] - drift[2] == pytest.approx(np.log(4) * 35 / 39, rel=0.05)
     panels = [axes.get_title() for axes in plot_evaluation(found).axes]
     assert sum(title.startswith("scale") for title in panels) == 1
+    assert found.scale is not None
+    steady = replace(found.scale, drift=0.001 * found.scale.drift)
+    axes = plot_scale(replace(found, scale=steady), ax=new_figure(4, 3).subplots())
+    low, high = axes.get_ylim()  # what is claimed is shown where no scale drifts
+    assert plot_axis(found, 0, ax=new_figure(4, 3).subplots()).get_ylabel() == "map units"
+    claimed = [np.nanmedian(np.abs(line.get_ydata())) for line in axes.lines[-2:]]
+    assert low < -max(claimed) < max(claimed) < high
 
 
 @pytest.mark.parametrize(("factor", "disproved"), [(0.3, False), (3.0, True)])

@@ -24,6 +24,7 @@ from jaxslam.plots.consistency import (
     plot_outside,
 )
 from jaxslam.plots.evaluation import plot_evaluation
+from jaxslam.plots.evaluation import plot_outside as plot_shares
 from jaxslam.plots.style import (
     COLUMN,
     End,
@@ -96,6 +97,7 @@ def test_a_line_that_breaks_off_is_named_at_its_last_number_and_one_without_any_
         (0.9, 300, ["1", "2", "5", "10", "20", "50", "100", "200"]),
         (0.002, 0.011, ["0.002", "0.003", "0.005", "0.01"]),
         (0.5, 5000, ["1", "10", "100", "1000"]),
+        (0.0012, 0.0019, ["0.0012", "0.0014", "0.0016", "0.0018"]),
     ],
 )
 def test_ticks_are_round_numbers_written_out(low, high, told):
@@ -107,6 +109,26 @@ def test_ticks_are_round_numbers_written_out(low, high, told):
     figure.draw_without_rendering()
     ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
     assert [label.get_text() for value, label in ticks if low <= value <= high][: len(told)] == told
+
+
+@pytest.mark.parametrize(("wrong", "said"), [(1000.0, "100 %"), (0.001, "0 %")])
+def test_shares_of_errors_are_written_out(wrong, said):
+    errors = wrong * (1.0 + np.arange(200.0).reshape(20, 5, 2))  # beyond 3 σ, or all inside
+    found = jaxslam.evaluate(errors, np.broadcast_to(np.eye(2), (20, 5, 2, 2)))
+    axes = plot_shares(found, ax=new_figure(4, 3).subplots())
+    assert [text.get_text().strip() for text in axes.texts] == [said, said]
+
+
+def test_stamps_of_a_clock_are_counted_from_the_first_pose():
+    times = 1.4e9 + np.linspace(0.3, 170.3, 10)
+    found = jaxslam.evaluate(np.ones((2, 10, 1)), np.ones((2, 10, 1, 1)), times=times)
+    figure = plot_evaluation(found)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert axes.get_xlabel() == "time from the first pose, s"
+    assert [x.get_text() for x in axes.get_xticklabels()] == ["0", "30", "60", "90", "120", "150"]
+    drawn_at = np.asarray(axes.lines[-1].get_xdata())  # as are those of another log beside it
+    np.testing.assert_allclose(drawn_at, times)
 
 
 def test_long_names_leave_most_of_a_column_to_the_lines(tmp_path):
@@ -200,6 +222,16 @@ def test_the_first_picture_of_the_site_is_as_the_program_draws_it_now(study):
         shown = json.loads(picture.info["Drawn"])
     now = json.loads(drawn(plot_consistency(study)).replace(f"{study.runs} runs", "1000 runs"))
     assert shown | {"title": ""} == now | {"title": ""}
+
+
+def test_the_map_of_a_run_fills_its_place_with_equal_units_and_warns_of_nothing(study, caplog):
+    figure = plot_consistency(study)
+    figure.draw_without_rendering()
+    (map_,) = (ax for ax in figure.axes if ax.get_xlabel() == "x, m")
+    place, (left, right), (low, high) = map_.get_window_extent(), map_.get_xlim(), map_.get_ylim()
+    assert place.width > 1.3 * place.height  # as wide as the axes beside it
+    assert place.width / (right - left) == pytest.approx(place.height / (high - low), rel=1e-3)
+    assert not caplog.records
 
 
 @pytest.mark.usefixtures("unchecked")

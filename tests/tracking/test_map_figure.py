@@ -50,7 +50,7 @@ def test_the_line_breaks_where_a_map_begins():
     estimate = line(axis, "estimate")
     assert len(estimate) == 31
     assert np.isnan(estimate[10]).all()
-    np.testing.assert_allclose(line(axis, "a map begins, 95 % of where"), [estimate[11]])
+    np.testing.assert_allclose(line(axis, "a map begins; ellipse: 95 %"), [estimate[11]])
     *_, ellipses = (c for c in axis.collections if isinstance(c, EllipseCollection))
     # Of z and x, as z is to the right: 2 sqrt(5.99 σ²).
     sizes = ellipses.get_widths(), ellipses.get_heights()
@@ -89,10 +89,11 @@ def test_what_is_longer_lies_to_the_right_in_equal_axes(width, titles):
 def test_a_path_that_is_small_in_its_map_is_shown_alone_too():
     axes = drawn(path_along_x(length=0.2), *wall())
     assert list(axes) == ["the path, from above", "from above", "from the side"]
-    low, high = axes["the path, from above"].get_ylim()[::-1]
-    assert (low, high) == pytest.approx((-0.012, 0.212))
-    low, high = axes["from above"].get_xlim()
-    assert high > 4
+    alone = axes["the path, from above"]
+    assert (alone.get_xlabel(), alone.get_ylabel()) == ("x (m)", "z (m)")
+    assert alone.get_xlim() == pytest.approx((-0.012, 0.212))
+    assert not alone.yaxis_inverted()
+    assert axes["from above"].get_xlim()[1] > 4
 
 
 def test_titles_count_what_is_not_shown():
@@ -157,5 +158,5 @@ def test_loops_join_two_places_and_the_path_without_them_lies_below():
     labels = [one.get_label() for one in axis.lines]
     assert labels.index("before loops were closed") < labels.index("estimate")
     labels = drawn(path_along_x(), *wall())["from above"].get_legend_handles_labels()[1]
-    never = {"a loop closed", "lost: only predicted", "reference", "a map begins, 95 % of where"}
+    never = {"a loop closed", "lost: only predicted", "reference", "a map begins; ellipse: 95 %"}
     assert not never & set(labels)

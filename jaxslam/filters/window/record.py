@@ -1,6 +1,6 @@
 """The record of a window: every measurement since its first frame, and its landmark.
 
-**Standing teaches nothing** of how the camera will move. While all pixels are where they were first
+Standing teaches nothing of how the camera will move. While all pixels are where they were first
 seen, the newest frame takes the place of the one before, and with the first motion the velocity is
 drawn anew.
 """
