@@ -189,6 +189,11 @@ def test_a_chain_of_nodes_follows_a_run_without_noise(geometry):
     assert (np.abs(chart - wanted) < 3 * sigma + 1e-6).all()
     assert (sigma[:, -1] < 0.2 * wanted[:, -1]).all()
 
+    # An edge stays when a landmark leaves that it was found from.
+    after = quick_jit(lambda *x: slam.remove(*x))(last(states), slots == 3)
+    assert not after.earlier.held.any()
+    np.testing.assert_array_equal(after.edge_covariance, last(states).edge_covariance)
+
 
 def test_a_landmark_is_marginalised_and_its_slot_is_free():
     slam, state, d = the_filter(PLANAR), last(level_run(PLANAR)[0]), 2
@@ -208,13 +213,6 @@ def test_a_landmark_is_marginalised_and_its_slot_is_free():
         camera_pose(slam, after),
         camera_pose(slam, state),
     )
-
-
-def test_an_edge_stays_when_a_landmark_leaves_that_it_was_found_from():
-    slam, (states, *_) = long_run(PLANAR)
-    after = quick_jit(lambda *x: slam.remove(*x))(last(states), jnp.arange(len(DEPTHS)) == 3)
-    assert not after.earlier.held.any()
-    np.testing.assert_array_equal(after.edge_covariance, last(states).edge_covariance)
 
 
 def test_a_calibration_that_is_drawn_in_every_frame_is_no_information():

@@ -136,9 +136,6 @@ def test_a_plain_filter_learns_what_it_cannot_see(name, world, landmark, least):
     assert forgotten > least
 
 
-# --- the gauge ------------------------------------------------------------------------------------
-
-
 MATCHED = jaxslam.scenario("matched-loose", landmarks=3)
 
 
@@ -181,9 +178,6 @@ def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scal
         return (Phi @ N - N_later)[keep]
 
     np.testing.assert_allclose(quick_jit(off)(jnp.asarray(log_scale)), 0, atol=1e-12)
-
-
-# --- first estimates ------------------------------------------------------------------------------
 
 
 SPACE = {
@@ -290,9 +284,6 @@ def test_oc_in_the_world_is_the_affine_filter():
     close(found, expected, 1e-10)
 
 
-# --- the right-invariant filter -------------------------------------------------------------------
-
-
 def predicted(slam, world):
     """A predicted state whose pose and landmarks are uncertain together, and its measurements."""
     start = case(world)
@@ -345,9 +336,6 @@ def test_cartesian_landmarks_are_corrected_as_published(world):
     close(after.core.pose.translation, published(T.translation(), T_added.translation()), 1e-12)
     # Not what addition gives.
     assert np.all(np.linalg.norm(added.landmarks - expected, axis=1) > 2 * bound)
-
-
-# --- landmarks that drift -------------------------------------------------------------------------
 
 
 def test_a_feature_of_a_landmark_that_drifts_is_expected_by_so_much_less_surely():

@@ -123,9 +123,6 @@ def minimum(*of):
     return precisely(*case(*of))
 
 
-# What is remembered
-
-
 def features(slots, measured, valid=None):
     valid = np.ones(len(slots), bool) if valid is None else valid
     return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid))
@@ -228,9 +225,6 @@ def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
     np.testing.assert_array_equal(other.motion[2], there.motion[2])
 
 
-# The quadratic
-
-
 def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem():
     slam, record, x, y = case(*PLANE)
     x, y = x + 0.1, y - 0.1
@@ -246,9 +240,6 @@ def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem():
     own = A[N:, N:].reshape(m, q, m, q)[np.arange(m), :, np.arange(m)]
     roots = np.asarray(got.landmarks.root)
     close(roots @ roots.transpose(0, 2, 1), own, 1e-8)
-
-
-# Minima
 
 
 def test_a_minimum_is_found_within_the_tolerance():
@@ -295,9 +286,6 @@ def test_a_landmark_does_not_take_a_step_that_costs_more(monkeypatch):
     np.testing.assert_allclose(y, [[0.0], [2.0]], atol=1e-12)
     np.testing.assert_allclose(cost, 4.0)
     assert minimise.landmarks(slam, record, at, start, 9)[1] < 1
-
-
-# Scale
 
 
 @pytest.mark.parametrize("of", [PLANE, SPACE], ids=["plane", "space"])
@@ -359,9 +347,6 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest():
         return sum(np.sum(np.square(u)) for u in longer(log_scale)) / 2
 
     np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, slope, rtol=1e-4)
-
-
-# What the filter goes on from
 
 
 def test_the_filters_state_is_the_gaussian_of_the_mode(monkeypatch):
