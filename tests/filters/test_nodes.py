@@ -188,6 +188,9 @@ def test_a_chain_of_nodes_follows_a_run_without_noise(geometry):
     assert slam.in_map(last(states)).all()
     assert (np.abs(chart - wanted) < 3 * sigma + 1e-6).all()
     assert (sigma[:, -1] < 0.2 * wanted[:, -1]).all()
+    (chain, log_scale), state = last(states).chain, last(states)
+    larger, _ = told(replace(state, chain=(chain, log_scale + 0.5)))
+    np.testing.assert_allclose(larger, chart * np.exp([*[0.0] * (chart.shape[1] - 1), -0.5]))
 
     # An edge stays when a landmark leaves that it was found from.
     after = quick_jit(lambda *x: slam.remove(*x))(last(states), slots == 3)

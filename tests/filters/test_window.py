@@ -242,6 +242,16 @@ def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem():
     close(roots @ roots.transpose(0, 2, 1), own, 1e-8)
 
 
+def test_a_reversed_start_goes_the_other_way_among_points_that_are_off_the_other_way():
+    slam, record, x, y = case(*SPACE)
+    back_x, back_y = modes.reversed_(slam, started(x, y))
+    there, back = (quick_jit(path)(slam, record, of).frames.pose for of in (x, back_x))
+    assert np.abs(there.translation()).max() > 0.1
+    np.testing.assert_allclose(back.translation(), -there.translation(), atol=1e-12)
+    np.testing.assert_allclose(back.rotation().as_matrix(), there.rotation().as_matrix())
+    np.testing.assert_array_equal(back_y, y * np.array([1, 1, -1]))
+
+
 def test_a_minimum_is_found_within_the_tolerance():
     """Of half the sum of squares, and in far fewer steps than are allowed."""
     slam, record, x, y = case(*PLANE)
