@@ -134,6 +134,18 @@ def test_sequential_ends_with_matches_that_all_fit_the_others():
         assert left @ np.linalg.solve(C, left) < chi2.ppf(GATE, 2)
 
 
+def test_snooping_puts_out_the_one_that_does_not_fit_all_the_others():
+    """By five of its σ given them, whether or not it fits its own ellipse."""
+    matches, _ = found(np.random.default_rng(8))
+    information = np.linalg.inv(np.asarray(matches.covariance).reshape(2 * M, 2 * M))
+    given_others = np.linalg.inv(information[8:10, 8:10])
+    residual = np.zeros((M, 2))
+    residual[4] = np.linalg.cholesky(given_others) @ [5.0, 0.0]
+    off = matches._replace(residual=jnp.asarray(residual))
+    left = quick_jit(association._snooped)(off, jnp.ones(M, bool))
+    assert np.flatnonzero(~left).tolist() == [4]
+
+
 @cache
 def matched():
     """A filter, the predicted state of its second frame, and the pixels of six landmarks there."""
