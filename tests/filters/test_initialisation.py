@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from cases import quick_jit
 
-from jaxslam.filters.gaussian import correct
 from jaxslam.filters.readouts import landmarks_in_camera
 from jaxslam.filters.rivals.depth_particles import DepthParticles
 from jaxslam.filters.rivals.rays import RaySum
@@ -204,28 +203,9 @@ def test_one_member_is_the_plain_filter():
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
 
 
-def test_federated_shares_of_copies_of_one_landmark_are_one_update():
-    slam = plain("robocentric", motion_sigma=0.1, speed_sigma=0.05)
-    state, _ = begun(slam, pixels(330.0, 330.0))
-    state = slam.predict(state, jnp.asarray(DT))
-    c = state.core_dim
-    copies = jnp.concatenate([jnp.arange(c + 2), jnp.arange(c, c + 2)])
-    state = replace(state, covariance=state.covariance[copies[:, None], copies])
-    corrected = quick_jit(partial(correct, slam))
-    seen = pixels(322.0, 322.0)
-    shared, _ = corrected(state, DT, replace(seen, noise_factor=1 / jnp.array([0.3, 0.7])))
-    alone, _ = corrected(state, DT, replace(seen, valid=jnp.array([True, False])))
-    np.testing.assert_allclose(shared.landmarks, alone.landmarks, rtol=1e-9)
-    np.testing.assert_allclose(shared.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
-
-
 def test_every_member_has_the_noise_of_its_measurement():
     """A noise factor of the sensor's is one of each member's share too."""
     twice = replace(pixels(330.0), noise_factor=jnp.array([4.0]))
     slam = the_filter("world", "rays", **THREE)
     factors = slam._of_members(twice, jnp.array([[0.5, 0.25, 0.25]])).noise_factor
     np.testing.assert_allclose(factors, [8.0, 16.0, 16.0])
-
-
-def test_numbers_after_a_modifier_are_the_greatest_depth():
-    assert plain("world+particles20").farthest == 20

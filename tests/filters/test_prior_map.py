@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from cases import a_filter, close, named, quick_jit
 
-import jaxslam
 from jaxslam.filters.gate import Gate
-from jaxslam.filters.readouts import camera_pose, landmarks_in_world
+from jaxslam.filters.readouts import landmarks_in_world
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS, Cartesian, InverseScaling
-from jaxslam.models.frame import Keyframe, Robocentric, Submaps, WorldCentric
+from jaxslam.models.frame import Keyframe, Robocentric, WorldCentric
 from jaxslam.models.motion import ConstantVelocity
-from jaxslam.models.observations import Capacity, Features, PriorMap
+from jaxslam.models.observations import Features, PriorMap
 from jaxslam.models.sensors import Position, RangeBearing
 from jaxslam.simulation import scenario
 
@@ -81,58 +80,6 @@ def test_in_a_gauge_a_prior_map_is_in_metres_whatever_the_unit():
     np.testing.assert_allclose(covariances, 0, atol=1e-13)
 
 
-DT, SIGMA, ACCELERATION, SPEED = 0.2, 0.1, 1e-3, 0.3
-
-
-def kalman(known, measured):
-    """The textbook filter of positions, velocities and points, dense and in the base frame."""
-    m = len(known.points)
-    x = np.concatenate([[0, 0, 0, 1.0], known.points.ravel()])
-    P = np.zeros((len(x), len(x)))
-    P[2:4, 2:4], P[4:, 4:] = SPEED**2 * np.eye(2), known.covariance
-    F, G = np.eye(len(x)), np.zeros((len(x), 2))
-    F[:2, 2:4], G[:2], G[2:4] = DT * np.eye(2), DT**2 * np.eye(2), DT * np.eye(2)
-    H = np.zeros((2 * m, len(x)))
-    H[:, :2], H[:, 4:] = np.tile(-np.eye(2), (m, 1)), np.eye(2 * m)
-    for z in measured:
-        x, P = F @ x, F @ P @ F.T + ACCELERATION**2 * G @ G.T
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + SIGMA**2 * np.eye(2 * m))
-        x, P = x + K @ (z.ravel() - H @ x), P - K @ H @ P
-    return x, P
-
-
-@pytest.mark.parametrize(
-    "frame", [Robocentric(), WorldCentric(), Keyframe(parallax=0.1), Submaps(2)], ids=named
-)
-def test_on_a_linear_problem_a_filter_with_a_prior_map_is_the_kalman_filter(frame):
-    known, rng = a_map(PLANAR, 1), np.random.default_rng(2)
-    slam = jaxslam.Slam(
-        ConstantVelocity([ACCELERATION] * 2 + [0.0], [0.0, 1.0, 0.0], [SPEED] * 2 + [0.0]),
-        Position(SIGMA), Cartesian(), frame,
-    )  # fmt: skip
-    measured = known.points - DT * np.arange(1, 7)[:, None, None] * [0.1, 0.9]
-    measured += SIGMA * rng.normal(size=measured.shape)
-    seen = Features(*map(jnp.asarray, (np.tile(SLOTS, (6, 1)), measured, np.ones((6, 3), bool))))
-    nothing = jax.tree.map(lambda x: x[0, :0], seen)
-
-    @quick_jit
-    def run(seen):
-        state = slam.init(Capacity(4, 3, 0), known=known)
-        step = lambda state, one: (slam.step(state, jnp.asarray(DT), one, nothing)[0], None)  # noqa: E731
-        state, _ = jax.lax.scan(step, state, seen)
-        return camera_pose(slam, state), landmarks_in_world(slam, state, SLOTS)
-
-    (pose, covariance), (points, covariances) = run(seen)
-    x, P = kalman(known, measured)
-    np.testing.assert_allclose(pose.translation(), x[:2], rtol=0, atol=1e-11)
-    np.testing.assert_allclose(points.ravel(), x[4:], rtol=0, atol=1e-11)
-    np.testing.assert_allclose(covariance[:2, :2], P[:2, :2], rtol=0, atol=1e-11)
-    blocks = P[4:, 4:].reshape(3, 2, 3, 2)[np.arange(3), :, np.arange(3)]
-    np.testing.assert_allclose(covariances, blocks, rtol=0, atol=1e-11)
-    # The map says where the camera is.
-    assert np.trace(P[:2, :2]) < 0.5 * (6 * DT * SPEED) ** 2
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_a_prior_map_of_another_shape_or_of_no_use_is_refused():
     pieces, known = scenario_pieces(scenario("matched")), a_map(PLANAR)
@@ -146,9 +93,6 @@ def test_a_prior_map_of_another_shape_or_of_no_use_is_refused():
     wrong = replace(known, covariance=known.covariance[:4, :4])
     with pytest.raises(ValueError, match=r"map's covariance has shape \(4, 4\); it needs \(6, 6\)"):
         make_filter("world", **pieces).init(4, known=wrong)
-
-
-# --- the noise of each measurement --------------------------------------------------------------
 
 
 class FarIsWorse(Position):
@@ -193,9 +137,9 @@ def test_every_measurement_has_its_own_noise():
     def run(sensor, factor):
         slam = a_filter(PLANAR, sensor=sensor, **still)
         seen = Features(slots, jnp.asarray(measured), valid, factor)
-        state = slam.predict(slam.init(2, seen), jnp.asarray(DT))
-        expected = slam.predict_features(state, jnp.asarray(DT), slots).covariance
-        after, innovation = slam.update(state, jnp.asarray(DT), seen)
+        state = slam.predict(slam.init(2, seen), jnp.asarray(0.2))
+        expected = slam.predict_features(state, jnp.asarray(0.2), slots).covariance
+        after, innovation = slam.update(state, jnp.asarray(0.2), seen)
         told = partial(landmarks_in_world, slam)
         S = innovation.covariance.reshape(2, 2, 2, 2)[slots, :, slots]
         return told(state, slots)[1], expected, S, told(after, slots)[1]

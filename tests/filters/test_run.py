@@ -1,6 +1,6 @@
 """Tests of a filter through a user's own frames."""
 
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,20 +10,13 @@ from cases import Case, quick_jit
 import jaxslam
 
 
-@cache
-def case():
-    return Case("matched", steps=4, landmarks=3)
-
-
-def frames_of(gone=None):
-    _, seen, new = case().frames(0)
-    return jaxslam.Frames(case().controls(), seen, new, gone)
-
-
 def test_a_run_is_its_steps_one_by_one():
     """Poses, covariances, NIS and status of each, and the last state; slots are freed before."""
-    slam, frames = case().filter("world"), frames_of(jnp.zeros((4, 3), bool).at[2, 1].set(True))
-    begun = quick_jit(partial(slam.init, 3))(case().frames(0)[0])
+    case = Case("matched", steps=4, landmarks=3)
+    slam, (first, seen, new) = case.filter("world"), case.frames(0)
+    gone = jnp.zeros((4, 3), bool).at[2, 1].set(True)
+    frames = jaxslam.Frames(case.controls(), seen, new, gone)
+    begun = quick_jit(partial(slam.init, 3))(first)
     last, found = quick_jit(partial(jaxslam.run, slam))(frames, begun)
 
     @quick_jit
@@ -41,10 +34,3 @@ def test_a_run_is_its_steps_one_by_one():
         np.testing.assert_allclose(found.covariance[k], P, atol=1e-12)
     assert found.nis_dof.tolist() == [3, 3, 2, 2]
     np.testing.assert_allclose(last.covariance, state.covariance, atol=1e-12)
-
-
-def test_what_is_collected_is_ones_own():
-    slam = case().filter("world")
-    own = partial(jaxslam.run, slam, output=lambda state, innovation, frame: frame.control + 1)
-    _, found = jax.eval_shape(own, frames_of(), slam.init(3))
-    assert found.shape == case().controls().shape

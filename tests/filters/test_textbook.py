@@ -4,9 +4,12 @@ The filter below is Thrun, Burgard, Fox, Probabilistic Robotics, chapter 10, wit
 its ranges and bearings: dense matrices in numpy, nothing of the library in it.
 """
 
+from functools import cache
+
 import jax
 import numpy as np
-from cases import Case
+import pytest
+from cases import Case, quick_rows
 
 STEPS = 30
 
@@ -97,3 +100,29 @@ def test_in_the_world_frame_the_filter_is_the_textbooks():
     assert 0 < sizes[0] < sizes[-1]
     assert (run.visible[1] & ~run.visible[-1]).any()
     assert np.trace(P[:3, :3]) > 1e-3
+
+
+@cache
+def straight():
+    """The heading is known, and everything linear."""
+    return Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
+
+
+OTHERS = ("world+oc", "world+fej", "world+decoupled", "invariant")
+
+
+@pytest.mark.parametrize(
+    "name", quick_rows(3, ["robocentric", "keyframe", "robocentric+submaps", *OTHERS])
+)
+def test_where_the_heading_is_known_every_filter_is_the_textbooks(name):
+    """One filter in every coordinates."""
+    case = straight()
+    run = jax.tree.map(np.asarray, case.run(0))
+    frames = case.controls(), *case.frames(0)
+    _, (poses, covariances, _, nis) = case.compiled(name, "cartesian")(*frames)
+    for k, (_, x, P, one_nis) in enumerate(textbook(run, case.scenario)):
+        np.testing.assert_allclose(poses.translation()[k], x[:2], rtol=0, atol=1e-10)
+        R = rotation(x[2])  # the pose's error is in the camera's axes
+        np.testing.assert_allclose(covariances[k][:2, :2], R.T @ P[:2, :2] @ R, atol=1e-10)
+        np.testing.assert_allclose(nis[k], one_nis, rtol=1e-8)
+    assert np.trace(P[:2, :2]) > 1e-3

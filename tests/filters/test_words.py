@@ -12,7 +12,6 @@ import jax
 import pytest
 from cases import a_filter, each_geometry, named
 
-from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
@@ -25,25 +24,10 @@ from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter, make_filters,
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS, InverseScaling
 from jaxslam.models.calibration import Known
-from jaxslam.models.frame import Submaps, WorldCentric
+from jaxslam.models.frame import Keyframe, Submaps, WorldCentric
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
-
-COLOURS = {"red": 1, "green": 2, "blue": 3}
-
-
-def test_names_are_looked_up_in_their_order():
-    assert list(lookup("colour", ["blue", "red"], COLOURS).items()) == [("blue", 3), ("red", 1)]
-    assert list(lookup("colour", iter(["green"]), COLOURS)) == ["green"]
-    assert list(lookup("colour", "red", COLOURS)) == ["red"]
-    for names, message in (
-        ([], r"^colour needs at least one name; known: red, green, blue$"),
-        (["gren"], r"^unknown colour 'gren' \(did you mean green\?\); known: red, green, blue$"),
-        (["red", "xyzzy"], r"^unknown colour 'xyzzy'; known: red, green, blue$"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            lookup("colour", names, COLOURS)
 
 
 def test_filters_are_made_of_every_pair_of_names():
@@ -60,7 +44,7 @@ def test_filters_are_made_of_every_pair_of_names():
 @pytest.mark.parametrize(
     ("filters", "landmarks", "calibration", "message"),
     [
-        (["wrold"], ["cartesian"], "known", r"filters 'wrold' \(did you mean world\?\); known: "),
+        (["wrold"], ["cartesian"], "known", r"unknown filters 'wrold' \(did you mean world\?\); k"),
         (["world"], ["cartesain"], "known", r"landmarks 'cartesain' \(did you mean cartesian\?\)"),
         ([], ["cartesian"], "known", "filters needs at least one name; known: robocentric, world"),
         (["world"], [], "known", "landmarks needs at least one name; known: inverse_scaling"),
@@ -183,6 +167,9 @@ def test_words_are_pieces():
     submaps = Slam(**pieces, frame=Submaps(spare=8, history=1, turn=0.5, parallax=0.5))
     assert made_or_told("robocentric+submaps8", InverseScaling()) == submaps
     assert submaps.frame == Submaps(8, 1)
+    assert getattr(made_or_told("world+particles20"), "farthest", None) == 20
+    nodes = made_or_told("robocentric+nodes30", "image_plane")
+    assert getattr(nodes, "left", None) == Keyframe(0.5, 0.3)
     drifting = RandomWalk(ObservabilityConstrained(), 0.3)
     names = ["scale_gauge", "drift30", "mixture3", "oc", "checked", "rest8", "scene50"]
     slam = Slam(
@@ -250,6 +237,7 @@ def test_every_filter_survives_a_pickle():
     names += ["scale_gauge+oc+scene50+drift+mixture3+rest8+submaps+checked"]
     filters = [slam for name in names if not isinstance(slam := made_or_told(name), str)]
     filters += [made_or_told("robocentric", landmark) for landmark in LANDMARKS]
+    filters += [made_or_told("robocentric+nodes", "image_plane")]
     assert len(filters) > 60
     for slam in filters:
         for again in journeys(slam):

@@ -139,9 +139,6 @@ def test_parameters_are_the_published_ones(geometry):
     np.testing.assert_allclose(transform(T, parameters)[: ray.size], T.translation(), atol=1e-15)
 
 
-# --- parallax angle -----------------------------------------------------------------------------
-
-
 def angle_between(a, b):
     return np.arccos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
 
@@ -183,9 +180,6 @@ def _main_and_ray(parameters, geometry):
     main = np.asarray(parameters[: geometry.point_dim])
     point = np.asarray(functions(ParallaxAngle())[-1](parameters))
     return main, (point - main) / np.linalg.norm(point - main)
-
-
-# --- conversions --------------------------------------------------------------------------------
 
 
 @cache

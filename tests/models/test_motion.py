@@ -60,11 +60,6 @@ def test_odometry_goes_straight_and_then_turns_by_its_reading_and_error(geometry
     np.testing.assert_allclose(step.translation(), reading[:n] + error[:n], rtol=1e-15)
 
 
-def models(geometry):
-    sigma = sigmas(geometry)
-    return [ConstantVelocity(sigma, sigma, sigma), Odometry(sigma)]
-
-
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_of_the_control_that_is_still_nothing_moves_and_another_models_is_refused(geometry):
     sigma = sigmas(geometry)

@@ -222,13 +222,3 @@ def test_the_command_writes_what_others_read(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "inverse_depth" in printed
     assert "∞" in printed
-
-
-def test_a_mistake_ends_with_status_2_and_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["triangulate", "--depth", "-3", "--out", str(tmp_path / "out")])
-    error = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert "depth must be positive" in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
