@@ -239,12 +239,9 @@ def _rotation_matrix(R: np.ndarray) -> np.ndarray:
 
 def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
     """The motion of points p by a small rotation about the origin: `ω ↦ ω × p`."""
-    zero = np.zeros(p.shape[:-1])
     if p.shape[-1] == 2:
         return np.stack([-p[..., 1], p[..., 0]], axis=-1)[..., None]
-    x, y, z = np.moveaxis(p, -1, 0)
-    rows = [[zero, z, -y], [-z, zero, x], [y, -x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.cross(p[..., None, :], np.eye(3))
 
 
 def _in_float64(
