@@ -164,6 +164,7 @@ def runs_of(
     source: Path, covariance: str | Path | None, truth: str | Path | None, estimate: str | None
 ) -> tuple[RunFiles, ...]:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
+    covariance = None if covariance is None else Path(covariance)
     bags = [source] if ros.is_bag(source) else sorted(filter(ros.is_bag, source.glob("*")))
     folders = sorted(x for x in source.glob("*/") if x.name[0] != ".")
     if bags and not any(_only(folder, ESTIMATES) for folder in (source, *folders)):
@@ -184,7 +185,7 @@ def runs_of(
                 ".csv file"
             )
         of_folder = source.stem in (Path(name).stem for name in ESTIMATES)
-        P = _path(covariance) or (_only(source.parent, COVARIANCES) if of_folder else None)
+        P = covariance or (_only(source.parent, COVARIANCES) if of_folder else None)
         return (RunFiles(source.stem, source, P, _truth_of(str(truth))),)
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
@@ -198,10 +199,6 @@ def runs_of(
     if not folders:
         return _beside_one_truth(source, truth)
     return tuple(_run(folder, None, truth) for folder in folders)
-
-
-def _path(given: str | Path | None) -> Path | None:
-    return None if given is None else Path(given)
 
 
 def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles, ...]:
@@ -226,7 +223,7 @@ def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
     return ros.chosen(bag, given, ros.POSES, "--truth", estimate)
 
 
-def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> RunFiles:
+def _run(folder: Path, covariance: Path | None, truth: str | Path | None) -> RunFiles:
     def found(names: tuple[str, ...]) -> Path:
         path = _only(folder, names)
         if path is None:
@@ -234,7 +231,7 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
         return path
 
     true = found(TRUTHS) if truth is None else _truth_of(str(truth))
-    P = _path(covariance) or _only(folder, COVARIANCES)
+    P = covariance or _only(folder, COVARIANCES)
     return RunFiles(folder.resolve().name, found(ESTIMATES), P, true)
 
 
@@ -282,7 +279,9 @@ def evaluate_runs(
         told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
     place = runs[0].estimate if len(runs) == 1 else source
     found = named(place, lambda: _compared(read, convention, how), names)
-    if late := _clocks(read, found):
+    wrong = suspect(found)
+    late = _offset(read) if wrong or time_offset == "auto" else None
+    if wrong and late is not None and late.found:
         offset, sigma = late
         try:
             fixed = _compared([paired(one.logs, offset) for one in read], convention, how)
@@ -300,7 +299,7 @@ def evaluate_runs(
             found = described(found, causes=(clock, *fixed.causes))
         found = described(found, time_offset=late)
     elif time_offset == "auto":
-        found = described(found, time_offset=_all_runs(read))
+        found = described(found, time_offset=late)
     told += (*_remarks(read), *_other_times(read, longest))
     if not read[0].logs.covariances.said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
@@ -319,22 +318,15 @@ def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> E
     )
 
 
-def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None:
-    """By how much the estimates are late and its σ, by the rotations of all runs; None where that
-    is not beyond doubt, or the filter is not over-confident."""
-    late = _all_runs(read) if suspect(found) else None
-    return late if late is not None and Offset(*late).found else None
-
-
-def _all_runs(read: list[RunLog]) -> tuple[float, float] | None:
-    """The mean offset of the runs' clocks, and its σ; None where rotations do not tell it."""
+def _offset(read: list[RunLog]) -> Offset | None:
+    """The mean offset of the runs' clocks; None where rotations do not tell it."""
     told = (one.logs.offset for one in read[:LOOKED_AT])
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None
     late, sigma = np.array(offsets).T
     weight = 1 / np.maximum(sigma, 1e-9) ** 2
-    return float(late @ weight / weight.sum()), float(weight.sum() ** -0.5)
+    return Offset(float(late @ weight / weight.sum()), float(weight.sum() ** -0.5))
 
 
 def _remarks(read: list[RunLog]) -> Iterator[str]:
