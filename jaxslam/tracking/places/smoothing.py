@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from jaxslam.io.logs.log import interpolated
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
@@ -76,11 +76,7 @@ class _Part:
 
 
 def _part_of(T: Transform, share: float) -> Transform:
-    part = np.eye(4)
-    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
-    part[:3, 3] = share * T[:3, 3]
-    return part
+    return interpolated(np.arange(2.0), np.array([np.eye(4), T]), np.array([share]))[0]
 
 
 def _parts(one: Map, graph: Graph, solved: Solved) -> list[_Part]:
