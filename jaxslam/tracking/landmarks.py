@@ -75,12 +75,3 @@ class Points(NamedTuple):
     """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
     in_map: np.ndarray
     """The same given where the map begins, (n, 3, 3)."""
-
-    def only(self, which: np.ndarray) -> Points:
-        """Some of them, in the order given."""
-        return Points(*(part[which] for part in self))
-
-
-def joined(parts: list[Points]) -> Points:
-    """Several as one; there is at least one."""
-    return Points(*(np.concatenate(of_all) for of_all in zip(*parts, strict=True)))

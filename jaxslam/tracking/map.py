@@ -16,8 +16,8 @@ from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.motion import Control
 from jaxslam.tracking.estimator import Estimator, Predicted
-from jaxslam.tracking.landmarks import Landmark, Points, joined
-from jaxslam.tracking.observations import Observations, Slots
+from jaxslam.tracking.landmarks import Landmark, Points
+from jaxslam.tracking.observations import Observations, Slots, joined, only
 from jaxslam.tracking.patches import Patch, Picture
 from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.submaps import (
@@ -265,7 +265,7 @@ class TrackerState:
             now = replace(now, latest_submap=number)
             found = replace(found, earlier=(*known.earlier, known), submap=number)
         back = [one.number for one in found.landmarks.values()]
-        finished = tuple(points.only(~np.isin(points.numbers, back)) for points in now.finished)
+        finished = tuple(only(points, ~np.isin(points.numbers, back)) for points in now.finished)
         return replace(now, map=found, left=left, seen=None, finished=finished)
 
     def fallen_back(self, predicted: Predicted) -> TrackerState:
@@ -322,7 +322,7 @@ class TrackerState:
         points = self._recorded(slots.tolist())
         some = [self.landmarks[slot] for slot in slots.tolist()]
         worst = worst_first(some, points, self.estimator.settings)[:missing]
-        return self.given_up(slots[worst].tolist(), points.only(worst))
+        return self.given_up(slots[worst].tolist(), only(points, worst))
 
     def _free(self, count: int) -> Int[np.ndarray, " n"]:
         """The first free slots."""

@@ -18,7 +18,7 @@ from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
-from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
+from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots, only
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
@@ -128,7 +128,7 @@ class Policy:
             chosen = self._of_several(seen.slots, matches, landmarks, agree, least)
         else:
             chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches))
-        agreed, variances = matches.only(chosen).first_of_each(rows)
+        agreed, variances = only(matches, chosen).first_of_each(rows)
         believed = np.isfinite(agreed[:, 0])
         if believed.sum() < least:
             believed[:] = False
@@ -154,7 +154,7 @@ class Policy:
         them be moved alike."""
         matched = seen.labelled("matched")
         whole, dof = nis(matched)
-        old, known = nis(matched.only(proven(matched.slots, landmarks)))
+        old, known = nis(only(matched, proven(matched.slots, landmarks)))
         asked = 2 * LEAST_MATCHES <= known < dof
         return not asked or bool(chi2.sf(whole - old, dof - known) > TOGETHER)
 
@@ -173,7 +173,7 @@ class Policy:
             return Lost.NOTHING_EXPECTED, doubtful
         if not seen.matched.any():
             return Lost.FEW_AGREE, doubtful
-        known = seen.only(proven(seen.slots, landmarks))
+        known = only(seen, proven(seen.slots, landmarks))
         agreed = known.labelled("matched")
         few = len(agreed.slots) <= MOST * len(known.slots)
         another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
@@ -210,11 +210,11 @@ class Policy:
         """
         for association in self.in_wide:
             places = np.flatnonzero(agree(slots[matches.owner], matches, association))
-            some = matches.only(places)
+            some = only(matches, places)
             lately, rigid = self._rigid([landmarks[slots[row]] for row in some.owner], some.pixels)
             tested = places[_alone(some.owner, rigid | ~lately)]
             rigid = np.isin(tested, places[rigid])
-            linear = agree(slots[matches.owner[tested]], matches.only(tested))
+            linear = agree(slots[matches.owner[tested]], only(matches, tested))
             predictable = 2 * (linear & rigid).sum() >= rigid.sum()
             best = tested[linear if predictable else rigid]
             if len(best) >= least + (0 if predictable else MINIMAL):
@@ -280,5 +280,5 @@ def _of_proven(
     """Return which matches of proven landmarks agree; none of the others does."""
     believed = proven(slots, landmarks)
     old = np.flatnonzero(believed)
-    believed[old] = agree(slots[old], matches.only(old), *association)
+    believed[old] = agree(slots[old], only(matches, old), *association)
     return believed

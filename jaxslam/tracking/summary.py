@@ -19,6 +19,7 @@ from jaxslam.io.calibration import INTRINSICS, MODELS, Calibration, as_fields
 from jaxslam.io.source import Source, Trajectory
 from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.observations import only
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import as_summary
@@ -187,7 +188,7 @@ def known_points(landmarks: Points, history: Sequence[Tracked]) -> Points:
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
         # A point is put into the map where its σ is below this share of its distance.
         known = np.isfinite(sigma) & (sigma < 0.3 * _distances(landmarks, history))
-    return landmarks.only(known)
+    return only(landmarks, known)
 
 
 def _distances(landmarks: Points, history: Sequence[Tracked]) -> Float[np.ndarray, " n"]:
