@@ -21,7 +21,7 @@ from jaxslam.io.recording import (
     of_files,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.text import numbers, read_table, text_lines
+from jaxslam.io.text import read_table, rows_of, text_lines
 
 CAMERAS = ("0", "2")
 
@@ -52,12 +52,11 @@ def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
     for number, line in text_lines(path).items():
         name, _, rest = line.partition(":")
         if name.strip() == f"P{camera}":
-            told, place = numbers(rest.split(), 12), f"{path}, line {number}"
-            if told is None:
-                raise ValueError(f"{place}: expected P{camera}: and twelve numbers")
-            P = np.array(told).reshape(3, 4)
+            told = rows_of(path, {number: rest.split()}, 12, f"P{camera}: and twelve numbers")
+            P = told.reshape(3, 4)
             if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
-                raise ValueError(f"{place}: not a projection matrix with a positive focal length")
+                wrong = "not a projection matrix with a positive focal length"
+                raise ValueError(f"{path}, line {number}: {wrong}")
             return P
     raise ValueError(f"{path} has no line P{camera}: for the images in image_{camera}")
 
