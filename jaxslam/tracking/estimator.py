@@ -114,12 +114,8 @@ class Estimator:
     inertial: Inertial | None = None
     """What tells the motion, if anything does."""
 
-    @classmethod
-    def of(
-        cls, slam: AbstractStaged, settings: TrackerSettings, inertial: Inertial | None = None
-    ) -> Estimator:
-        """With the filter's numbers in 64 bits."""
-        return cls(cast(slam, jnp.float64), settings, inertial)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "slam", cast(self.slam, jnp.float64))
 
     def empty(self, before: Belief | None = None) -> Belief:
         """The state of a map without landmarks, whose inertial unit goes on as `before`."""
@@ -159,14 +155,13 @@ class Estimator:
         ellipses or the settings'."""
         association = ASSOCIATIONS[self.settings.association] if wide is None else wide
         found = self.candidates(predicted, slots, matches, curved=wide is not None)
-        believed = _believed(association, *self._of_fixed_size(*found, wide is not None))
+        believed = _believed(association, self._of_fixed_size(found, several=wide is not None))
         return np.asarray(believed)[: len(slots)]
 
     def candidates(
         self, predicted: Predicted, slots: Int[np.ndarray, " m"], matches: Matches, *, curved: bool
-    ) -> tuple[np.ndarray, ...]:
-        """Return the innovations of matches, as `Candidates` has them: residuals, covariance, and
-        which are valid; and their slots."""
+    ) -> Candidates:
+        """Return the innovations of matches, and their slots as landmarks."""
         R, i = self.settings.pixel_sigma**2 * np.eye(2), np.arange(len(slots))
         S = predicted.joint[slots][:, :, slots]
         same = slots[:, None] == slots
@@ -178,7 +173,7 @@ class Estimator:
         more = self.settings.noise_factors(matches.variances) - 1 + self.settings.tolerance**2
         S[i, :, i] += more[:, None, None] * R
         view = predicted.view
-        return matches.pixels - view.pixels[slots], S, view.usable[slots], slots
+        return Candidates(matches.pixels - view.pixels[slots], S, view.usable[slots], slots)
 
     def nis(self, predicted: Predicted, seen: Observations) -> tuple[float, int]:
         """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
@@ -293,10 +288,10 @@ class Estimator:
             return Predicted(still, ahead, gaussian, joint, Prediction(*view))
 
         def believed(association: Association | None) -> None:
-            nothing = np.zeros((0, 2)), np.zeros((0, 2, 0, 2)), np.zeros(0, bool), np.zeros(0, int)
-            several = association is not None
+            S, slots, several = np.zeros((0, 2, 0, 2)), np.zeros(0, int), association is not None
+            nothing = Candidates(np.zeros((0, 2)), S, np.zeros(0, bool), slots)
             one = association or ASSOCIATIONS[self.settings.association]
-            _believed.compile(one, *self._of_fixed_size(*nothing, several))
+            _believed.compile(one, self._of_fixed_size(nothing, several=several))
             if several:
                 _curved.compile(slam, *predicted()[1:3], still)
 
@@ -319,22 +314,17 @@ class Estimator:
             ),
         ]
 
-    def _of_fixed_size(
-        self,
-        residual: Float[np.ndarray, "m 2"],
-        covariance: Float[np.ndarray, "m 2 m 2"],
-        valid: Bool[np.ndarray, " m"],
-        slots: Int[np.ndarray, " m"],
-        several: bool,
-    ) -> tuple[np.ndarray, ...]:
-        """Return the parts of `Candidates`, as many as there can be: those added are not valid."""
-        m, size = len(slots), self.settings.wanted * (PEAKS if several else 1)
+    def _of_fixed_size(self, found: Candidates, *, several: bool) -> Candidates:
+        """Return as many as there can be, by their landmarks: those added are not valid."""
+        slots, m = found.landmark, len(found.landmark)
+        size = self.settings.wanted * (PEAKS if several else 1)
         padded = np.tile(np.eye(2)[:, None], (size, 1, size, 1)) * np.eye(size)[:, None, :, None]
-        padded[:m, :, :m] = covariance
+        padded[:m, :, :m] = found.covariance
         landmark = np.argmax(slots == slots[:, None], axis=1) if m else slots
         more = (0, size - m)
         landmark = np.pad(landmark, more, constant_values=size - 1)
-        return np.pad(residual, (more, (0, 0))), padded, np.pad(valid, more), landmark
+        residual, valid = np.pad(found.residual, (more, (0, 0))), np.pad(found.valid, more)
+        return Candidates(residual, padded, valid, landmark)
 
     def _innovations(
         self, predicted: Predicted, seen: Observations
@@ -460,14 +450,8 @@ def _predict(
 
 
 @Program
-def _believed(
-    association: Association,
-    residual: jax.Array,
-    covariance: jax.Array,
-    valid: jax.Array,
-    landmark: jax.Array,
-) -> Bool[jax.Array, " m"]:
-    return association(Candidates(residual, covariance, valid, landmark))
+def _believed(association: Association, found: Candidates) -> Bool[jax.Array, " m"]:
+    return association(found)
 
 
 @Program

@@ -59,7 +59,7 @@ def start(
     """The state before the first frame of a camera with this calibration, and maybe a unit whose
     readings tell its motion to a filter that has its model."""
     with jax.enable_x64(True):
-        estimator = Estimator.of(slam, settings, inertial)
+        estimator = Estimator(slam, settings, inertial)
         return TrackerState(estimator, calibration, Map(estimator.empty()))
 
 
@@ -97,7 +97,7 @@ def step(
         tracked = Tracked.of(frame, state.map, repeated=True)
     else:
         with jax.enable_x64(True):
-            state = replace(state, estimator=Estimator.of(slam, settings, inertial))
+            state = replace(state, estimator=Estimator(slam, settings, inertial))
             try:
                 after, tracked = _taken(state, frame, waited, sighting)
             except (FloatingPointError, LinAlgError):
