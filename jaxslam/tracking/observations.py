@@ -46,6 +46,13 @@ def joined(tables: Sequence[Table]) -> Table:
     return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
 
 
+def distances(
+    off: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+) -> Float[np.ndarray, " k"]:
+    """Squared distances `νᵀ S⁻¹ ν`."""
+    return np.einsum("ki,ki->k", off, np.linalg.solve(covariances, off[..., None])[..., 0])
+
+
 class Prediction(NamedTuple):
     """The view that the filter expects, a row for each slot of its map."""
 

@@ -18,7 +18,7 @@ from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
-from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots, only
+from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots, distances, only
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
@@ -247,10 +247,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     """Return whether a linear prediction given what is believed explains most of that."""
     slots = seen.slots[seen.matched]
     off = seen.pixels[seen.matched] - given.pixels[slots]
-    weighted = np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
-    squared = np.einsum("ki,ki->k", off, weighted)
     # The share that a linear prediction must explain for that second search.
-    return bool(np.mean(squared < GATE) > 0.8)
+    return bool(np.mean(distances(off, given.covariances[slots]) < GATE) > 0.8)
 
 
 def more_than_chance(searched: int, chance: float = CHANCE) -> int:

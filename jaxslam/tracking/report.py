@@ -16,7 +16,7 @@ from jaxslam.io.source import Frame
 from jaxslam.io.tum import tum_text
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.observations import NOTHING, Lost, Observations, distances
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 
@@ -118,9 +118,7 @@ class Tracked:
         for agreement: of two degrees of freedom each where the prediction is right."""
         seen = self.observations
         found = np.isfinite(seen.pixels[:, 0])
-        off = (seen.pixels - seen.predicted)[found]
-        weighted = np.linalg.solve(seen.covariances[found], off[..., None])[..., 0]
-        return np.einsum("ki,ki->k", off, weighted)
+        return distances((seen.pixels - seen.predicted)[found], seen.covariances[found])
 
     @property
     def state(self) -> str:
