@@ -124,29 +124,21 @@ def _evaluate_arrays(
     needed = {"dof"} if held and held[0] in _ALONE else {"covariances", *of_poses}
     if len(held) != 1 or not needed <= arrays.keys():
         raise ValueError(f"contains {', '.join(arrays)}; expected {_CONTENTS}")
-    times = arrays.get("times")
-    if held[0] in _ALONE:
-        _refuse_options(stated, how)
-        quantity = "NIS" if nis else held[0].upper()
-        return evaluate_nees(arrays[held[0]], arrays["dof"], times=times, quantity=quantity)
-    P = arrays["covariances"]
-    if held == ["estimates"]:
+    given, times = arrays[held[0]], arrays.get("times")
+    if of_poses:
         said = {name: str(*np.ravel(arrays[name])[:1]) for name in CHOICES if name in arrays}
-        convention = stated_before(said, stated)
-        truths = arrays["truths"]
-        return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
-    _refuse_options(stated, how)
-    quantity = "NIS" if nis or held == ["innovations"] else "NEES"
-    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
-    return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
-
-
-def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
+        P, truths, convention = arrays["covariances"], arrays["truths"], stated_before(said, stated)
+        return evaluate_poses(given, P, truths, convention, times=times, **how)
     if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
         raise ValueError(
             "a convention, an alignment, axes used and σ of the truth apply to poses, but the "
             "file has errors; give estimates, covariances and truths instead"
         )
+    quantity = "NIS" if nis or held[0] in ("nis", "innovations") else "NEES"
+    if held[0] in _ALONE:
+        return evaluate_nees(given, arrays["dof"], times=times, quantity=quantity)
+    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
+    return evaluate(given, arrays["covariances"], times=times, names=names, quantity=quantity)
 
 
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
@@ -394,13 +386,9 @@ def named(
 
 def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
     """A remark where steps, which are counted, are not at the same times after the first pose."""
-
-    def since(one: RunLog, steps: int) -> np.ndarray:
-        return one.times[:steps] - one.times[0]
-
     for one in read:
-        steps = len(one.times)
-        if np.abs(since(one, steps) - since(longest, steps)).max() > MAX_TIME_DIFFERENCE:
+        later = one.times - longest.times[: len(one.times)]
+        if np.abs(later - later[0]).max() > MAX_TIME_DIFFERENCE:
             yield (
                 "steps are counted from the first pose of each run; their times differ between "
                 f"runs, and are those of {longest.logs.files.name}"

@@ -120,8 +120,8 @@ def evaluate_poses(
         best = identified.nees[identified.consistent[0]]
         what = "the convention of the covariances is another"
         told = (Mistake(what, identified.sentence, best),)
-    how = {"times": at, "timed": times is not None, "identified": identified}
-    return described(found, causes=told, **how)
+    timed = times is not None
+    return described(found, causes=told, times=at, timed=timed, identified=identified)
 
 
 def as_stated(poses: Poses, asked: PoseComparison) -> Evaluation:
