@@ -153,10 +153,7 @@ def straight_line(
 
 
 def turned_about(
-    fit: Similarity,
-    line: Float[np.ndarray, " 3"],
-    estimates: Float[np.ndarray, "k 4 4"],
-    reference: Float[np.ndarray, "k 4 4"],
+    fit: Similarity, line: Float[np.ndarray, " 3"], estimates: Matrices, reference: Matrices
 ) -> Similarity:
     """A fit whose rotation about a line is that of all orientations, not of the positions.
 
@@ -172,9 +169,7 @@ def turned_about(
     return Similarity(rotation, target - fit.scale * rotation @ centre, fit.scale)
 
 
-def at_first_pose(
-    estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"], *, yaw: bool = False
-) -> Similarity:
+def at_first_pose(estimate: Matrices, truth: Matrices, *, yaw: bool = False) -> Similarity:
     """The rigid motion that takes one pose to another, or its position and `yaw`."""
     n = len(estimate) - 1
     motion = truth @ np.linalg.inv(estimate)

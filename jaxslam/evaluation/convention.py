@@ -134,11 +134,7 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
     yield from (slice(i, min(i + size, count)) for i in range(0, count, size))
 
 
-def pose_errors(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-) -> Float[np.ndarray, "*batch t"]:
+def pose_errors(convention: Convention, estimates: Matrices, truths: Matrices) -> Tangents:
     """The error of every pose in the convention."""
     T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
     result = np.empty((len(T), geometry_of(T).tangent_dim))
@@ -173,12 +169,7 @@ def from_right(convention: Convention, estimates: Matrices) -> Squares:
     return turning(convention, estimates) @ M
 
 
-def converted(
-    covariances: Float[np.ndarray, "*batch t t"],
-    poses: Float[np.ndarray, "*batch d d"],
-    old: Convention,
-    new: Convention,
-) -> Float[np.ndarray, "*batch t t"]:
+def converted(covariances: Squares, poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Convert covariances of poses from one convention to another."""
     T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
     transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))

@@ -19,6 +19,7 @@ from jaxslam.evaluation.convention import (
     CHOICES,
     Convention,
     Joints,
+    Squares,
     Values,
     blocks,
     geometry_of,
@@ -201,9 +202,7 @@ class EvaluatedSteps(NamedTuple):
     """A word on those that are known by definition."""
 
 
-def without_known(
-    errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"], logged: Mask
-) -> EvaluatedSteps:
+def without_known(errors: PerAxis, covariances: Squares, logged: Mask) -> EvaluatedSteps:
     """The steps that were logged, but for those that a run knows by definition at its beginning.
 
     Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
@@ -401,9 +400,7 @@ def checked_poses(
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, convention, joints)
 
 
-def without_unknown(
-    P: Float[np.ndarray, "runs steps t t"], *, marked: bool = True
-) -> Float[np.ndarray, "runs steps t t"]:
+def without_unknown(P: Squares, *, marked: bool = True) -> Squares:
     """The covariances, with a variance of `UNKNOWN`, and none with others, on the axes where that
     of every pose is that or larger: what programs write of what they do not estimate. In files it
     may be `marked` by −1."""

@@ -19,6 +19,8 @@ from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
+    Matrices,
+    Squares,
     converted,
     covariances_of_file,
     geometry_of,
@@ -303,9 +305,7 @@ def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
     return True, []
 
 
-def _truths(
-    logs: RunLogs, log: Log, P: Float[np.ndarray, "n t t"]
-) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"], list[str]]:
+def _truths(logs: RunLogs, log: Log, P: Squares) -> tuple[Matrices, Matrices, list[str]]:
     """The true poses of every estimate, NaN where there is none, the estimates, and remarks.
 
     Raises ValueError where there is none.

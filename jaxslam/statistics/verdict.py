@@ -207,11 +207,7 @@ def _logged(nees: PerStep, logged: Mask | None) -> Mask:
     return there
 
 
-def lost_runs(
-    nees: Float[np.ndarray, "runs steps"],
-    dof: int,
-    logged: Bool[np.ndarray, "runs steps"] | None = None,
-) -> list[int]:
+def lost_runs(nees: PerStep, dof: int, logged: Mask | None = None) -> list[int]:
     """The numbers of the runs lost at any of their steps; for `logged` see `Tally.of`.
 
     Of right runs one in 10 000 is lost, or fewer, however many steps they have. Raises ValueError
@@ -411,9 +407,7 @@ def _digits(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
-def innovation_verdict(
-    nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"], dof: int
-) -> Verdict:
+def innovation_verdict(nis: PerStep, normalised: PerAxis, dof: int) -> Verdict:
     """The verdict on innovations, of every step where they seem white, else of every run.
 
     It is that of `run_verdict`; `samples` says whether steps or runs are counted. Innovations,

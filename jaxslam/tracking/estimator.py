@@ -145,11 +145,7 @@ class Estimator:
         return Predicted(control, state, gaussian, joint, view)
 
     def believes(
-        self,
-        predicted: Predicted,
-        slots: Int[np.ndarray, " m"],
-        matches: Matches,
-        wide: Association | None = None,
+        self, predicted: Predicted, slots: Slots, matches: Matches, wide: Association | None = None
     ) -> Bool[np.ndarray, " m"]:
         """Return which matches, of landmarks in these slots, agree, by an association for `wide`
         ellipses or the settings'."""

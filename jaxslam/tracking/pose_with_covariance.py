@@ -15,6 +15,8 @@ from jaxslam.evaluation.convention import lever
 
 Transform = Float[np.ndarray, "4 4"]
 """A pose as a matrix."""
+Transforms = Float[np.ndarray, "n 4 4"]
+"""Poses as matrices."""
 Pixels = Float[np.ndarray, "k 2"]
 """Pixels (u, v) of k landmarks."""
 Places = Float[np.ndarray, "n 2"]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Image, Source, Trajectory
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform
+from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform, Transforms
 
 NOISE = 2.0  # standard deviation of the sensor noise, in grey levels
 SUPERSAMPLING = 2
@@ -71,9 +71,7 @@ def synthetic_source(
     return Source(f"synthetic (seed {seed})", calibration, times, images, Trajectory(times, T_wc))
 
 
-def handheld_trajectory(
-    times: Float[np.ndarray, " n"], seed: int = 0
-) -> Float[np.ndarray, "n 4 4"]:
+def handheld_trajectory(times: Float[np.ndarray, " n"], seed: int = 0) -> Transforms:
     """Poses T_wc (n, 4, 4) at times in seconds: swaying sideways, with all six degrees of freedom.
 
     Sums of two sinusoids for each of x, y, z (m) and the rotation vector (rad), shifted so that
