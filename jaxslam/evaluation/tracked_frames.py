@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
 from jaxslam.io.text import text_lines
+from jaxslam.io.tum import Times
 
 FRAMES = "frames.csv"
 _COLUMNS = ("time", "state", "map", "unit_fixed")
@@ -29,9 +30,7 @@ class EvaluatedPoses(NamedTuple):
     """Masks of the poses of other maps, of lost frames, and from before the unit was fixed."""
 
 
-def evaluated_poses(
-    folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
-) -> EvaluatedPoses:
+def evaluated_poses(folder: Path, times: Times, known: Bool[np.ndarray, " n"]) -> EvaluatedPoses:
     """The poses at these times that the tracker's file in the folder leaves to be evaluated.
 
     They are of the longest map, without frames that are lost or whose unit is not fixed. A pose

@@ -22,6 +22,7 @@ from jaxslam.io.recording import (
 )
 from jaxslam.io.source import Trajectory
 from jaxslam.io.text import read_table, rows_of, text_lines
+from jaxslam.io.tum import Times
 
 CAMERAS = ("0", "2")
 
@@ -39,7 +40,7 @@ def _open(path: Path, _rate: float) -> Recording:
     return of_files(path, files, times, calibration, reference)
 
 
-def _read_times(path: Path) -> Float[np.ndarray, " n"]:
+def _read_times(path: Path) -> Times:
     expected = "finite times in seconds"
     table = read_table(path, "times", "times", expected)
     times = table.numbers(expected, [0])[:, 0]
@@ -73,9 +74,7 @@ def _poses_of(path: Path) -> tuple[Path, Path]:
     return path / "poses.txt", sequence.parent.parent / "poses" / f"{sequence.name}.txt"
 
 
-def _camera_truth(
-    path: Path, times: Float[np.ndarray, " n"], P: Float[np.ndarray, "3 4"] | None
-) -> Trajectory:
+def _camera_truth(path: Path, times: Times, P: Float[np.ndarray, "3 4"] | None) -> Trajectory:
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
     row = "12 finite numbers, the rows of a 3x4 T_wc"
     rows = read_table(path, "poses", "poses", row).numbers(row, range(12)).reshape(-1, 3, 4)

@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam.io.text import read_table
 
+Times = Float[np.ndarray, " n"]
+"""Times of poses or of other rows, s, or in a unit yet to be found."""
+
 
 def quaternions(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Return rotation matrices as quaternions x, y, z, w, of which w is not negative."""

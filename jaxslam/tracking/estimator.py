@@ -48,7 +48,7 @@ from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
-from jaxslam.tracking.pose_with_covariance import Pixels, Positions, Spreads, Transform
+from jaxslam.tracking.pose_with_covariance import Depths, Pixels, Positions, Spreads, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -234,11 +234,7 @@ class Estimator:
         return _at_rest(self.slam, state)
 
     def begin(
-        self,
-        state: Belief,
-        slots: Slots,
-        pixels: Pixels,
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, state: Belief, slots: Slots, pixels: Pixels, depths: Depths | None = None
     ) -> tuple[Belief, CameraReport]:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""

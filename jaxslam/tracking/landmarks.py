@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -59,6 +60,10 @@ class Landmark:
             return replace(self, success=success, missed=self.missed + 1)
         count = self.found + 1
         return replace(self, success=success, missed=0, unseen=0, seen_at=pixel, found=count)
+
+
+Landmarks = Mapping[int, Landmark]
+"""Landmarks by their slots of a filter's map, or by their numbers."""
 
 
 class Points(NamedTuple):

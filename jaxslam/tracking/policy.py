@@ -3,7 +3,7 @@ contradict what the map has proven."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ran
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.estimator import Estimator, Predicted
-from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.landmarks import Landmark, Landmarks
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
 from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots, distances, only
@@ -111,7 +111,7 @@ class Policy:
         self,
         seen: Observations,
         matches: Matches,
-        landmarks: Mapping[int, Landmark],
+        landmarks: Landmarks,
         agree: Agreement,
         *,
         lost: bool,
@@ -146,9 +146,7 @@ class Policy:
         sigma = 1.5 + turned @ turned / (2 * self.calibration.fx)
         return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
 
-    def _likely_given_proven(
-        self, seen: Observations, landmarks: Mapping[int, Landmark], nis: Surprise
-    ) -> bool:
+    def _likely_given_proven(self, seen: Observations, landmarks: Landmarks, nis: Surprise) -> bool:
         """Return whether what is matched of landmarks that are not proven is likely, all together,
         given what is matched of those that are: each by itself may be within its gate, and all of
         them be moved alike."""
@@ -161,7 +159,7 @@ class Policy:
     def reason(
         self,
         seen: Observations,
-        landmarks: Mapping[int, Landmark],
+        landmarks: Landmarks,
         agree: Agreement,
         nis: Surprise,
         *,
@@ -194,12 +192,7 @@ class Policy:
         return bool(agree(others.slots, matches).sum() >= least)
 
     def _of_several(
-        self,
-        slots: Slots,
-        matches: Matches,
-        landmarks: Mapping[int, Landmark],
-        agree: Agreement,
-        least: int,
+        self, slots: Slots, matches: Matches, landmarks: Landmarks, agree: Agreement, least: int
     ) -> Int[np.ndarray, " m"]:
         """Return those that agree, of landmarks with several places each, if they are `least` at
         least.
@@ -263,13 +256,13 @@ def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[n
     return some[count[of] == 1]
 
 
-def proven(slots: Slots, landmarks: Mapping[int, Landmark]) -> Bool[np.ndarray, " k"]:
+def proven(slots: Slots, landmarks: Landmarks) -> Bool[np.ndarray, " k"]:
     """Return which of the slots hold landmarks that are proven."""
     return np.array([landmarks[slot].found >= PROVEN for slot in slots], bool)
 
 
 def _of_proven(
-    landmarks: Mapping[int, Landmark],
+    landmarks: Landmarks,
     agree: Agreement,
     slots: Int[np.ndarray, " m"],
     matches: Matches,

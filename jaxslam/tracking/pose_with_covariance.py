@@ -23,6 +23,8 @@ Places = Float[np.ndarray, "n 2"]
 """Pixels (u, v) of n points."""
 Positions = Float[np.ndarray, "n 3"]
 """n points."""
+Depths = tuple[np.ndarray, np.ndarray]
+"""Means and σ of 1/z of n points, (n, 1)."""
 Spreads = Float[np.ndarray, "n 3 3"]
 """Their covariances."""
 

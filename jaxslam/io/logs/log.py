@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.text import Table
-from jaxslam.io.tum import of_xytheta, rows_as_poses
+from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
@@ -76,9 +76,7 @@ def log(
     return Log(times, T, P, said, notes, oriented=oriented)
 
 
-def in_seconds(
-    table: Table, times: Float[np.ndarray, " n"], unit: str = ""
-) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
+def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple[str, ...]]:
     """Times in seconds, of the `unit` that is said, there or by the title of a first column; or of
     the only one in which they are `STEPS` apart.
 
@@ -105,23 +103,23 @@ def unit_in(title: str) -> str:
     return found[found.lastindex or 0] if found else ""
 
 
-def unit_of(times: Float[np.ndarray, " n"]) -> str | None:
+def unit_of(times: Times) -> str | None:
     """The only unit of time in which they are `STEPS` apart; None where there is none, or two."""
     fit = units_of(times)
     return fit[0] if len(fit) == 1 else None
 
 
-def units_of(times: Float[np.ndarray, " n"]) -> list[str]:
+def units_of(times: Times) -> list[str]:
     """The units of time in which they are `STEPS` apart."""
     step = _step(times)
     return [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
 
 
-def _step(times: Float[np.ndarray, " n"]) -> float:
+def _step(times: Times) -> float:
     return float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
 
 
-def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
+def check_seconds(what: str, times: Times) -> None:
     """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
     last, step = float(np.abs(times).max()), _step(times)
     # Seconds between two poses, more than a moving thing has.
