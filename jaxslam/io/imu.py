@@ -52,7 +52,7 @@ _UNITS = ((r"m(dps|deg.*)", np.pi / 180e3), (r"dps|deg.*|°.*", np.pi / 180),
 """Units of readings that a title says, in rad/s and m/s²."""
 
 
-Rows = Float[np.ndarray, "n 7"]
+Rows = Float[np.ndarray, "_ 7"]
 """Rows `t, gyroscope, accelerometer`."""
 
 

@@ -194,7 +194,9 @@ class TrackerState:
         begun = self.with_map(state=state, place=self.map.place.begun(report))
         return begun._with_new(slots, image, pixels)
 
-    def renewed(self, image: Picture, pixels: Pixels, kept: Slots = NO_SLOTS) -> TrackerState:
+    def renewed(
+        self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS
+    ) -> TrackerState:
         """The state at the end of the filter's frame, with new landmarks at these pixels, for which
         others than those in the slots `kept` make room."""
         now = self._with_room(len(pixels), kept)

@@ -6,7 +6,6 @@ It is a fold: `step` takes a `TrackerState` and a frame to the next state.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,7 @@ from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import JERK, LEAST_MATCHES, LIVELY, Policy
 from jaxslam.tracking.pose_with_covariance import Pixels, Places, Transform
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.report import History, Tracked
 from jaxslam.tracking.settings import INERTIAL, TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
@@ -342,7 +341,7 @@ class Tracker:
         with jax.enable_x64(True):
             return self.state.points()
 
-    def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+    def smoothed(self, history: History) -> tuple[list[Tracked], Points]:
         """Return the frames so far, and all landmarks, as all that was seen later has them: loops
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
