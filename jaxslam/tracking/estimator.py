@@ -6,7 +6,6 @@ Features beyond those that there are have no valid pixel, so that no frame compi
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -329,12 +328,7 @@ class Estimator:
         return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
-        self,
-        create: Callable[..., tuple[Belief, Report]],
-        state: Belief,
-        slots: Slots,
-        pixels: Pixels,
-        *depths: PyTree,
+        self, create: Program, state: Belief, slots: Slots, pixels: Pixels, *depths: PyTree
     ) -> tuple[Belief, CameraReport]:
         new = _padded(slots, pixels, self.settings.wanted)
         state, found = create(self.slam, state, new, *depths)
