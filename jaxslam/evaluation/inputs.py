@@ -95,17 +95,9 @@ def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
     return f"run {place[0]}, step {place[1]}"
 
 
-class Paired(NamedTuple):
-    """The errors and covariances that belong together."""
-
-    errors: PerAxis
-    covariances: Float[np.ndarray, "runs steps n n"]
-    logged: Mask
-    """A mask of the steps of every run that are there; the others are zeros, of unit covariance."""
-
-
-def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
-    """Return errors and covariances, and a mask of the steps that have them.
+def paired(errors: ArrayLike, covariances: ArrayLike) -> tuple[PerAxis, Squares, Mask]:
+    """Return errors and covariances, and a mask of the steps that have them; the others are zeros,
+    of unit covariance.
 
     A step whose error or covariance is all NaN was not logged. Raises ValueError, naming
     run and step, for any other number that is not finite, and for a run without a step.
@@ -119,7 +111,7 @@ def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
     check_finite("errors", e, logged)
     check_finite("covariances", P, logged)
     check_every_run(logged)
-    return Paired(filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged)
+    return filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged
 
 
 def padded(
@@ -191,19 +183,11 @@ def exactly_known(covariances: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarr
     return ~np.any(covariances, axis=(-2, -1))
 
 
-class EvaluatedSteps(NamedTuple):
-    """The steps that have a part in a verdict."""
-
-    start: int
-    """The first step at which any run has one."""
-    logged: Mask
-    """A mask of them, among all steps."""
-    notes: tuple[str, ...]
-    """A word on those that are known by definition."""
-
-
-def without_known(errors: PerAxis, covariances: Squares, logged: Mask) -> EvaluatedSteps:
-    """The steps that were logged, but for those that a run knows by definition at its beginning.
+def without_known(
+    errors: PerAxis, covariances: Squares, logged: Mask
+) -> tuple[int, Mask, tuple[str, ...]]:
+    """The steps that were logged, but for those that a run knows by definition at its beginning:
+    the first at which any run has one, a mask of them, and a word on what is known.
 
     Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
@@ -231,7 +215,7 @@ def without_known(errors: PerAxis, covariances: Squares, logged: Mask) -> Evalua
         )
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
-    return EvaluatedSteps(start, left, _left_out(logged & before, start))
+    return start, left, _left_out(logged & before, start)
 
 
 def _left_out(known: Mask, start: int) -> tuple[str, ...]:

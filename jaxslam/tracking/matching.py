@@ -102,17 +102,11 @@ def match_patches(
     return Matches(chosen.owner, pixels, chosen.scores, variances)
 
 
-class Fit(NamedTuple):
-    """How n templates fit a picture."""
-
-    pixels: Places
-    """Where, sub-pixel."""
-    variances: Float[np.ndarray, " n"]
-    """The variance of each pixel's u and v, pixels²."""
-
-
-def refine(image: Grey, templates: Windows, pixels: Places) -> Fit:
-    """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
+def refine(
+    image: Grey, templates: Windows, pixels: Places
+) -> tuple[Places, Float[np.ndarray, " n"]]:
+    """The places near `pixels` to which affine maps fit templates best, by Gauss-Newton, and the
+    variance of each pixel's u and v, pixels².
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
     gain and offset do not matter), with a prior on the map: the identity, with a σ of `_MAP_SIGMA`.
@@ -141,7 +135,7 @@ def refine(image: Grey, templates: Windows, pixels: Places) -> Fit:
     maps = np.where(gone[:, None, None], identity, maps)
     windows, likeness = known.compared(image, places, maps)
     s2 = 2 * np.maximum(1 - likeness, 0.0) / windows.shape[1]
-    return Fit(places, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2)
+    return places, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2
 
 
 class _Templates(NamedTuple):
