@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, Log, in_seconds
+from jaxslam.io.logs.log import MIXED, Log, in_seconds, symmetric
 from jaxslam.io.logs.unnamed import is_deviations, without_values
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import write_table
@@ -373,11 +373,8 @@ def _of_triangle(
 
     Column by column is also a lower triangle row by row.
     """
-    rows, columns = np.triu_indices(t)
-    by_row, by_column = np.zeros((2, len(values), t, t))
-    by_row[:, rows, columns] = by_row[:, columns, rows] = values
-    rows, columns = np.tril_indices(t)
-    by_column[:, rows, columns] = by_column[:, columns, rows] = values
+    both = np.triu_indices(t), np.tril_indices(t)
+    by_row, by_column = (symmetric(values, np.transpose(places), t) for places in both)
 
     def least(P):
         return np.linalg.eigvalsh(P)[:, 0] / np.maximum(np.abs(P).max(axis=(1, 2)), 1e-300)

@@ -24,7 +24,7 @@ from jaxslam.evaluation.convention import (
     blocks,
     geometry_of,
 )
-from jaxslam.io.logs.log import check_seconds
+from jaxslam.io.logs.log import check_seconds, symmetric
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
@@ -575,9 +575,7 @@ def _matrices_of(told: Float[np.ndarray, "k c"], n: int, kind: str) -> Float[np.
         return told.reshape(-1, n, n)
     if kind == "σ":
         return of_sigmas(told[None])[0]
-    P, upper = np.empty((len(told), n, n)), np.triu_indices(n)
-    P[:, *upper] = P[:, *upper[::-1]] = told
-    return P
+    return symmetric(told, np.transpose(np.triu_indices(n)), n)
 
 
 def _rectangle(

@@ -136,7 +136,7 @@ def check_seconds(what: str, times: Times) -> None:
 
 
 def symmetric(
-    values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]], t: int = 6
+    values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]] | np.ndarray, t: int = 6
 ) -> Float[np.ndarray, "n t t"]:
     """Symmetric matrices with the columns of `values` at these places, and zeros elsewhere."""
     P = np.zeros((len(values), t, t))
