@@ -347,9 +347,8 @@ def covariances_of_file(path: str | Path, t: int = 6) -> Log:
     if deviations:
         expected = f"{count} finite numbers, OpenVINS's time and deviations"
     there = ~without_values(rows)
-    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1))
-    if wrong.size or not (deviations or count in kinds):
-        raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
+    wrong = ~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1)
+    table.check(wrong if wrong.any() else wrong | (not deviations and count not in kinds), expected)
     said, unit = _said(table, MIXED if deviations else {})
     P = np.full((len(rows), t, t), np.nan)
     times, notes = in_seconds(table, rows[:, 0])

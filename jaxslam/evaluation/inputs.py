@@ -546,9 +546,7 @@ def _check_rows(table: Table, found: _Columns, row: str) -> None:
     errors, P = (np.isnan(x) for x in np.split(table.rows[:, before:], [n], axis=1))
     without = errors.all(axis=1) | (P.all(axis=1) & (found.n > 0))
     finite = np.isfinite(table.rows)
-    wrong = ~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1))
-    if wrong.any():
-        raise ValueError(f"{table.place(np.argmax(wrong))}: expected {row}")
+    table.check(~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1)), row)
 
 
 def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:

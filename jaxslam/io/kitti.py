@@ -22,7 +22,7 @@ from jaxslam.io.recording import (
 )
 from jaxslam.io.source import Trajectory
 from jaxslam.io.text import read_table, rows_of, text_lines
-from jaxslam.io.tum import Times
+from jaxslam.io.tum import Times, transforms
 
 CAMERAS = ("0", "2")
 
@@ -79,8 +79,7 @@ def _camera_truth(path: Path, times: Times, P: Float[np.ndarray, "3 4"] | None) 
     row = "12 finite numbers, the rows of a 3x4 T_wc"
     rows = read_table(path, "poses", "poses", row).numbers(row, range(12)).reshape(-1, 3, 4)
     _check_count(path, len(rows), len(times))
-    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3] = rows
+    T_wc = transforms(rows[:, :, :3], rows[:, :, 3])
     check_rigid(path, T_wc)
     if P is not None:
         T_wc[:, :3, 3] -= rows[:, :, :3] @ np.linalg.solve(P[:, :3], P[:, 3])

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
@@ -37,6 +38,11 @@ class Table(NamedTuple):
         """Name a row by file and line."""
         return f"{self.path}, line {self.lines[row]}"
 
+    def check(self, wrong: ArrayLike, expected: str) -> None:
+        """Raise ValueError for the first row that is wrong, with what is expected there."""
+        for row in np.flatnonzero(wrong)[:1]:
+            raise ValueError(f"{self.place(row)}: expected {expected}")
+
     def numbers(
         self, expected: str, columns: Sequence[int] = (), *, spare: bool = True
     ) -> Float[np.ndarray, "n m"]:
@@ -49,9 +55,7 @@ class Table(NamedTuple):
         if max(columns) >= count or not (spare or len(columns) == count):
             raise ValueError(f"{self.place(0)}: expected {expected}")
         found = self.rows[:, columns]
-        wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
-        if wrong.size:
-            raise ValueError(f"{self.place(wrong[0])}: expected {expected}")
+        self.check(~np.isfinite(found).all(axis=1), expected)
         return found
 
 

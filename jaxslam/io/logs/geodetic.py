@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
 from jaxslam.io.text import Table, rows_of
+from jaxslam.io.tum import transforms
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
@@ -91,10 +92,9 @@ def _log(
     square = FLATTENING * (2 - FLATTENING)
     radius = EQUATOR / np.sqrt(1 - square * np.sin(latitude) ** 2)
     (cn, sn), (ce, se) = ((np.cos(x), np.sin(x)) for x in (latitude, longitude))
-    T = np.tile(np.eye(4), (len(times), 1, 1))
     zero = np.zeros_like(sn)
     axes = (-se, ce, zero), (-sn * ce, -sn * se, cn), (cn * ce, cn * se, sn)
-    T[:, :3, :3] = np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0))
     along = (radius + height) * cn
-    T[:, :3, 3] = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
+    p = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
+    T = transforms(np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0)), p)
     return Log(times, T, P, SAID, (NOTE,), oriented=False, world="ECEF")

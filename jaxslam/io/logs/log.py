@@ -69,9 +69,8 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if covariances is None else covariances
-    wrong = np.flatnonzero(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
-    if wrong.size:
-        raise ValueError(f"{table.place(wrong[0])}: expected a covariance of finite numbers")
+    part = np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2))
+    table.check(part, "a covariance of finite numbers")
     times, notes = in_seconds(table, times, unit)
     return Log(times, T, P, said, notes, oriented=oriented)
 
@@ -82,9 +81,7 @@ def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple
 
     Raises ValueError, naming the line, for a time that is none.
     """
-    wrong = np.flatnonzero(~np.isfinite(times))
-    if wrong.size:
-        raise ValueError(f"{table.place(wrong[0])}: expected a finite time")
+    table.check(~np.isfinite(times), "a finite time")
     if unit := unit or unit_in("".join(table.titles[:1])):
         return times * UNITS[unit], ()
     try:
