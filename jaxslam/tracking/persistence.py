@@ -28,6 +28,9 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import Join, MapInWorld
 
 FORMAT = "jaxslam tracker 10"
+Header = Mapping[str, Json]
+"""Words and numbers, as JSON has them."""
+Arrays = Mapping[str, np.ndarray]
 
 _RECORDS: tuple[type, ...] = (
     TrackerState, Map, MapInWorld, PoseWithCovariance, Landmark, Patch, Points, Submap,
@@ -127,9 +130,7 @@ def load(
 class _Reader:
     """Makes of what was written what it was, of a tracker that begins with the state `new`."""
 
-    def __init__(
-        self, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray], new: TrackerState
-    ) -> None:
+    def __init__(self, header: Header, arrays: Arrays, new: TrackerState) -> None:
         self._new, self._like = new, {"state": new.map.state}
         ends = dict.fromkeys(arrays, 0)
         self._arrays: list[np.ndarray] = []
@@ -169,9 +170,7 @@ class _Reader:
         return jax.tree.unflatten(structure, [jnp.asarray(x) for x in value])
 
 
-def write_record(
-    path: str | Path, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray]
-) -> None:
+def write_record(path: str | Path, header: Header, arrays: Arrays) -> None:
     """Write both as one .npz archive, whole or not at all. Numbers keep their last digit."""
     text = json.dumps({"format": FORMAT, **header})
     with write_atomically(path) as temporary, temporary.open("wb") as file:
