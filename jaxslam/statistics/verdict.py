@@ -89,8 +89,8 @@ class Tally:
         """Return the tally that `asdict` wrote; one written without thirds has none."""
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
-        first, second, last = (PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
-        return Tally(*counts, *sums, numbers.get("fitted", 0.0), (first, second, last))
+        thirds = tuple(PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
+        return Tally(*counts, *sums, numbers.get("fitted", 0.0), thirds)
 
     @staticmethod
     def of_numbers(numbers: Float[np.ndarray, " 27"], dof: int, fitted: float = 0.0) -> Tally:
