@@ -153,10 +153,7 @@ def straight_line(
 
 
 def turned_about(
-    fit: Similarity,
-    line: Float[np.ndarray, " 3"],
-    estimates: Float[np.ndarray, "k 4 4"],
-    reference: Float[np.ndarray, "k 4 4"],
+    fit: Similarity, line: Float[np.ndarray, " 3"], estimates: Matrices, reference: Matrices
 ) -> Similarity:
     """A fit whose rotation about a line is that of all orientations, not of the positions.
 
@@ -172,9 +169,7 @@ def turned_about(
     return Similarity(rotation, target - fit.scale * rotation @ centre, fit.scale)
 
 
-def at_first_pose(
-    estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"], *, yaw: bool = False
-) -> Similarity:
+def at_first_pose(estimate: Matrices, truth: Matrices, *, yaw: bool = False) -> Similarity:
     """The rigid motion that takes one pose to another, or its position and `yaw`."""
     n = len(estimate) - 1
     motion = truth @ np.linalg.inv(estimate)
@@ -195,44 +190,29 @@ def projected(
     along the axes of the world. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
     `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
-    if covariances.ndim == 3:
-        return _projected_by_blocks(T_wc, covariances, align, line)
-    U = gauge_directions(T_wc, align)
-    V = _fitted(U, line)
-    count, t = U.shape[:2]
-    P = np.swapaxes(covariances.reshape(count, t, count, t), 1, 2)
-    VP = np.einsum("kta,kjtu->jau", V, P)
-    UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
-    return _projected(P[range(count), range(count)], UW, VP, np.sum(VP @ V, axis=0))
-
-
-def _projected_by_blocks(
-    T_wc: Float[np.ndarray, "k d d"],
-    P: Float[np.ndarray, "k t t"],
-    align: str,
-    line: Float[np.ndarray, " 3"] | None,
-) -> Float[np.ndarray, "k t t"]:
-    """The same of errors that are independent: its sums over all poses first, then every pose."""
+    count, P, of_all = len(T_wc), covariances, None
+    if P.ndim == 2:
+        P = np.swapaxes(P.reshape(count, len(P) // count, count, -1), 1, 2)
+        of_all = np.einsum("kta,kjtu->jau", _fitted(gauge_directions(T_wc, align), line), P)
+        P = P[range(count), range(count)]
 
     def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         U = gauge_directions(T_wc[part], align)
         V = _fitted(U, line)
-        return U, V, np.swapaxes(V, 1, 2) @ P[part]
+        return U, V, np.swapaxes(V, 1, 2) @ P[part] if of_all is None else of_all[part]
 
     VU, VPV = np.zeros(()), np.zeros(())
-    for part in blocks(len(T_wc)):
+    for part in blocks(count):
         U, V, VP = of(part)
         VU, VPV = VU + np.einsum("kta,ktb->ab", V, U), VPV + np.sum(VP @ V, axis=0)
     W, result = np.linalg.pinv(VU), np.empty_like(P)
-    for part in blocks(len(T_wc)):
+    for part in blocks(count):
         U, _, VP = of(part)
-        result[part] = _projected(P[part], U @ W, VP, VPV)
+        UW = U @ W
+        lost = UW @ VP
+        lost = lost + np.swapaxes(lost, 1, 2)
+        result[part] = P[part] - lost + UW @ VPV @ np.swapaxes(UW, 1, 2)
     return result
-
-
-def _projected(P: np.ndarray, UW: np.ndarray, VP: np.ndarray, VPV: np.ndarray) -> np.ndarray:
-    lost = UW @ VP
-    return P - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
 
 
 def _fitted(
@@ -332,17 +312,16 @@ def _laid(
     joint: Joints | None,
 ) -> tuple[Poses, Float[np.ndarray, " runs"]]:
     """Every run in the world of its truth, and the log of its unit; errors are split."""
-    T, P, log_scale = poses.estimates.copy(), poses.covariances, np.zeros(len(poses.logged))
-    B = np.tile(np.eye(P.shape[-1]), (*P.shape[:2], 1, 1)) if joint is not None else None
+    T, P, motions = poses.estimates.copy(), poses.covariances, []
     for i, run in enumerate(_runs(poses)):
         motion, own = lay(run)
-        block, there = motion.block, poses.logged[i]
-        transport(own, lambda _, block=block: block)
-        T[i, there], P[i, there] = motion.moved(run.estimates), own
-        log_scale[i] = -np.log(motion.scale)
-        if B is not None:
-            B[i] = block
-    joint = None if joint is None or B is None else _joint(joint, B)
+        motions.append(motion)
+        transport(own, lambda _: motions[-1].block)
+        T[i, poses.logged[i]], P[i, poses.logged[i]] = motion.moved(run.estimates), own
+    if joint is not None:
+        B = np.array([motion.block for motion in motions])[:, None]
+        joint = _joint(joint, np.broadcast_to(B, P.shape))
+    log_scale = -np.log([motion.scale for motion in motions])
     return poses._replace(estimates=T, joint=joint), log_scale
 
 

@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, Log, in_seconds
+from jaxslam.io.logs.log import MIXED, Log, in_seconds, symmetric
 from jaxslam.io.logs.unnamed import is_deviations, without_values
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import write_table
@@ -134,11 +134,7 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
     yield from (slice(i, min(i + size, count)) for i in range(0, count, size))
 
 
-def pose_errors(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-) -> Float[np.ndarray, "*batch t"]:
+def pose_errors(convention: Convention, estimates: Matrices, truths: Matrices) -> Tangents:
     """The error of every pose in the convention."""
     T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
     result = np.empty((len(T), geometry_of(T).tangent_dim))
@@ -173,12 +169,7 @@ def from_right(convention: Convention, estimates: Matrices) -> Squares:
     return turning(convention, estimates) @ M
 
 
-def converted(
-    covariances: Float[np.ndarray, "*batch t t"],
-    poses: Float[np.ndarray, "*batch d d"],
-    old: Convention,
-    new: Convention,
-) -> Float[np.ndarray, "*batch t t"]:
+def converted(covariances: Squares, poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Convert covariances of poses from one convention to another."""
     T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
     transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
@@ -239,12 +230,9 @@ def _rotation_matrix(R: np.ndarray) -> np.ndarray:
 
 def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
     """The motion of points p by a small rotation about the origin: `ω ↦ ω × p`."""
-    zero = np.zeros(p.shape[:-1])
     if p.shape[-1] == 2:
         return np.stack([-p[..., 1], p[..., 0]], axis=-1)[..., None]
-    x, y, z = np.moveaxis(p, -1, 0)
-    rows = [[zero, z, -y], [-z, zero, x], [y, -x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.cross(p[..., None, :], np.eye(3))
 
 
 def _in_float64(
@@ -359,9 +347,8 @@ def covariances_of_file(path: str | Path, t: int = 6) -> Log:
     if deviations:
         expected = f"{count} finite numbers, OpenVINS's time and deviations"
     there = ~without_values(rows)
-    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1))
-    if wrong.size or not (deviations or count in kinds):
-        raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
+    wrong = ~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1)
+    table.check(wrong if wrong.any() else wrong | (not deviations and count not in kinds), expected)
     said, unit = _said(table, MIXED if deviations else {})
     P = np.full((len(rows), t, t), np.nan)
     times, notes = in_seconds(table, rows[:, 0])
@@ -385,11 +372,8 @@ def _of_triangle(
 
     Column by column is also a lower triangle row by row.
     """
-    rows, columns = np.triu_indices(t)
-    by_row, by_column = np.zeros((2, len(values), t, t))
-    by_row[:, rows, columns] = by_row[:, columns, rows] = values
-    rows, columns = np.tril_indices(t)
-    by_column[:, rows, columns] = by_column[:, columns, rows] = values
+    both = np.triu_indices(t), np.tril_indices(t)
+    by_row, by_column = (symmetric(values, np.transpose(places), t) for places in both)
 
     def least(P):
         return np.linalg.eigvalsh(P)[:, 0] / np.maximum(np.abs(P).max(axis=(1, 2)), 1e-300)

@@ -19,11 +19,12 @@ from jaxslam.evaluation.convention import (
     CHOICES,
     Convention,
     Joints,
+    Squares,
     Values,
     blocks,
     geometry_of,
 )
-from jaxslam.io.logs.log import check_seconds
+from jaxslam.io.logs.log import check_seconds, symmetric
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
@@ -94,17 +95,9 @@ def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
     return f"run {place[0]}, step {place[1]}"
 
 
-class Paired(NamedTuple):
-    """The errors and covariances that belong together."""
-
-    errors: PerAxis
-    covariances: Float[np.ndarray, "runs steps n n"]
-    logged: Mask
-    """A mask of the steps of every run that are there; the others are zeros, of unit covariance."""
-
-
-def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
-    """Return errors and covariances, and a mask of the steps that have them.
+def paired(errors: ArrayLike, covariances: ArrayLike) -> tuple[PerAxis, Squares, Mask]:
+    """Return errors and covariances, and a mask of the steps that have them; the others are zeros,
+    of unit covariance.
 
     A step whose error or covariance is all NaN was not logged. Raises ValueError, naming
     run and step, for any other number that is not finite, and for a run without a step.
@@ -118,7 +111,7 @@ def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
     check_finite("errors", e, logged)
     check_finite("covariances", P, logged)
     check_every_run(logged)
-    return Paired(filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged)
+    return filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged
 
 
 def padded(
@@ -190,21 +183,11 @@ def exactly_known(covariances: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarr
     return ~np.any(covariances, axis=(-2, -1))
 
 
-class EvaluatedSteps(NamedTuple):
-    """The steps that have a part in a verdict."""
-
-    start: int
-    """The first step at which any run has one."""
-    logged: Mask
-    """A mask of them, among all steps."""
-    notes: tuple[str, ...]
-    """A word on those that are known by definition."""
-
-
 def without_known(
-    errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"], logged: Mask
-) -> EvaluatedSteps:
-    """The steps that were logged, but for those that a run knows by definition at its beginning.
+    errors: PerAxis, covariances: Squares, logged: Mask
+) -> tuple[int, Mask, tuple[str, ...]]:
+    """The steps that were logged, but for those that a run knows by definition at its beginning:
+    the first at which any run has one, a mask of them, and a word on what is known.
 
     Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
@@ -232,7 +215,7 @@ def without_known(
         )
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
-    return EvaluatedSteps(start, left, _left_out(logged & before, start))
+    return start, left, _left_out(logged & before, start)
 
 
 def _left_out(known: Mask, start: int) -> tuple[str, ...]:
@@ -401,9 +384,7 @@ def checked_poses(
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, convention, joints)
 
 
-def without_unknown(
-    P: Float[np.ndarray, "runs steps t t"], *, marked: bool = True
-) -> Float[np.ndarray, "runs steps t t"]:
+def without_unknown(P: Squares, *, marked: bool = True) -> Squares:
     """The covariances, with a variance of `UNKNOWN`, and none with others, on the axes where that
     of every pose is that or larger: what programs write of what they do not estimate. In files it
     may be `marked` by −1."""
@@ -565,9 +546,7 @@ def _check_rows(table: Table, found: _Columns, row: str) -> None:
     errors, P = (np.isnan(x) for x in np.split(table.rows[:, before:], [n], axis=1))
     without = errors.all(axis=1) | (P.all(axis=1) & (found.n > 0))
     finite = np.isfinite(table.rows)
-    wrong = ~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1))
-    if wrong.any():
-        raise ValueError(f"{table.place(np.argmax(wrong))}: expected {row}")
+    table.check(~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1)), row)
 
 
 def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:
@@ -594,9 +573,7 @@ def _matrices_of(told: Float[np.ndarray, "k c"], n: int, kind: str) -> Float[np.
         return told.reshape(-1, n, n)
     if kind == "σ":
         return of_sigmas(told[None])[0]
-    P, upper = np.empty((len(told), n, n)), np.triu_indices(n)
-    P[:, *upper] = P[:, *upper[::-1]] = told
-    return P
+    return symmetric(told, np.transpose(np.triu_indices(n)), n)
 
 
 def _rectangle(

@@ -124,29 +124,21 @@ def _evaluate_arrays(
     needed = {"dof"} if held and held[0] in _ALONE else {"covariances", *of_poses}
     if len(held) != 1 or not needed <= arrays.keys():
         raise ValueError(f"contains {', '.join(arrays)}; expected {_CONTENTS}")
-    times = arrays.get("times")
-    if held[0] in _ALONE:
-        _refuse_options(stated, how)
-        quantity = "NIS" if nis else held[0].upper()
-        return evaluate_nees(arrays[held[0]], arrays["dof"], times=times, quantity=quantity)
-    P = arrays["covariances"]
-    if held == ["estimates"]:
+    given, times = arrays[held[0]], arrays.get("times")
+    if of_poses:
         said = {name: str(*np.ravel(arrays[name])[:1]) for name in CHOICES if name in arrays}
-        convention = stated_before(said, stated)
-        truths = arrays["truths"]
-        return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
-    _refuse_options(stated, how)
-    quantity = "NIS" if nis or held == ["innovations"] else "NEES"
-    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
-    return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
-
-
-def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
+        P, truths, convention = arrays["covariances"], arrays["truths"], stated_before(said, stated)
+        return evaluate_poses(given, P, truths, convention, times=times, **how)
     if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
         raise ValueError(
             "a convention, an alignment, axes used and σ of the truth apply to poses, but the "
             "file has errors; give estimates, covariances and truths instead"
         )
+    quantity = "NIS" if nis or held[0] in ("nis", "innovations") else "NEES"
+    if held[0] in _ALONE:
+        return evaluate_nees(given, arrays["dof"], times=times, quantity=quantity)
+    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
+    return evaluate(given, arrays["covariances"], times=times, names=names, quantity=quantity)
 
 
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
@@ -164,6 +156,7 @@ def runs_of(
     source: Path, covariance: str | Path | None, truth: str | Path | None, estimate: str | None
 ) -> tuple[RunFiles, ...]:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
+    covariance = None if covariance is None else Path(covariance)
     bags = [source] if ros.is_bag(source) else sorted(filter(ros.is_bag, source.glob("*")))
     folders = sorted(x for x in source.glob("*/") if x.name[0] != ".")
     if bags and not any(_only(folder, ESTIMATES) for folder in (source, *folders)):
@@ -184,7 +177,7 @@ def runs_of(
                 ".csv file"
             )
         of_folder = source.stem in (Path(name).stem for name in ESTIMATES)
-        P = _path(covariance) or (_only(source.parent, COVARIANCES) if of_folder else None)
+        P = covariance or (_only(source.parent, COVARIANCES) if of_folder else None)
         return (RunFiles(source.stem, source, P, _truth_of(str(truth))),)
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
@@ -198,10 +191,6 @@ def runs_of(
     if not folders:
         return _beside_one_truth(source, truth)
     return tuple(_run(folder, None, truth) for folder in folders)
-
-
-def _path(given: str | Path | None) -> Path | None:
-    return None if given is None else Path(given)
 
 
 def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles, ...]:
@@ -226,7 +215,7 @@ def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
     return ros.chosen(bag, given, ros.POSES, "--truth", estimate)
 
 
-def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> RunFiles:
+def _run(folder: Path, covariance: Path | None, truth: str | Path | None) -> RunFiles:
     def found(names: tuple[str, ...]) -> Path:
         path = _only(folder, names)
         if path is None:
@@ -234,7 +223,7 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
         return path
 
     true = found(TRUTHS) if truth is None else _truth_of(str(truth))
-    P = _path(covariance) or _only(folder, COVARIANCES)
+    P = covariance or _only(folder, COVARIANCES)
     return RunFiles(folder.resolve().name, found(ESTIMATES), P, true)
 
 
@@ -282,7 +271,9 @@ def evaluate_runs(
         told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
     place = runs[0].estimate if len(runs) == 1 else source
     found = named(place, lambda: _compared(read, convention, how), names)
-    if late := _clocks(read, found):
+    wrong = suspect(found)
+    late = _offset(read) if wrong or time_offset == "auto" else None
+    if wrong and late is not None and late.found:
         offset, sigma = late
         try:
             fixed = _compared([paired(one.logs, offset) for one in read], convention, how)
@@ -300,7 +291,7 @@ def evaluate_runs(
             found = described(found, causes=(clock, *fixed.causes))
         found = described(found, time_offset=late)
     elif time_offset == "auto":
-        found = described(found, time_offset=_all_runs(read))
+        found = described(found, time_offset=late)
     told += (*_remarks(read), *_other_times(read, longest))
     if not read[0].logs.covariances.said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
@@ -319,22 +310,15 @@ def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> E
     )
 
 
-def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None:
-    """By how much the estimates are late and its σ, by the rotations of all runs; None where that
-    is not beyond doubt, or the filter is not over-confident."""
-    late = _all_runs(read) if suspect(found) else None
-    return late if late is not None and Offset(*late).found else None
-
-
-def _all_runs(read: list[RunLog]) -> tuple[float, float] | None:
-    """The mean offset of the runs' clocks, and its σ; None where rotations do not tell it."""
+def _offset(read: list[RunLog]) -> Offset | None:
+    """The mean offset of the runs' clocks; None where rotations do not tell it."""
     told = (one.logs.offset for one in read[:LOOKED_AT])
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None
     late, sigma = np.array(offsets).T
     weight = 1 / np.maximum(sigma, 1e-9) ** 2
-    return float(late @ weight / weight.sum()), float(weight.sum() ** -0.5)
+    return Offset(float(late @ weight / weight.sum()), float(weight.sum() ** -0.5))
 
 
 def _remarks(read: list[RunLog]) -> Iterator[str]:
@@ -402,13 +386,9 @@ def named(
 
 def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
     """A remark where steps, which are counted, are not at the same times after the first pose."""
-
-    def since(one: RunLog, steps: int) -> np.ndarray:
-        return one.times[:steps] - one.times[0]
-
     for one in read:
-        steps = len(one.times)
-        if np.abs(since(one, steps) - since(longest, steps)).max() > MAX_TIME_DIFFERENCE:
+        later = one.times - longest.times[: len(one.times)]
+        if np.abs(later - later[0]).max() > MAX_TIME_DIFFERENCE:
             yield (
                 "steps are counted from the first pose of each run; their times differ between "
                 f"runs, and are those of {longest.logs.files.name}"

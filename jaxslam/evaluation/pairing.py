@@ -19,6 +19,8 @@ from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
+    Matrices,
+    Squares,
     converted,
     covariances_of_file,
     geometry_of,
@@ -28,6 +30,7 @@ from jaxslam.evaluation.tracked_frames import EvaluatedPoses, evaluated_poses
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
 from jaxslam.io.logs.log import Log, check_seconds, interpolated
+from jaxslam.io.tum import Times
 
 Place: TypeAlias = Path | ros.Topic
 LEAST_SHARE = 0.5
@@ -303,9 +306,7 @@ def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
     return True, []
 
 
-def _truths(
-    logs: RunLogs, log: Log, P: Float[np.ndarray, "n t t"]
-) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"], list[str]]:
+def _truths(logs: RunLogs, log: Log, P: Squares) -> tuple[Matrices, Matrices, list[str]]:
     """The true poses of every estimate, NaN where there is none, the estimates, and remarks.
 
     Raises ValueError where there is none.
@@ -353,9 +354,7 @@ def _truths(
     return nearest, log.poses, [note] if elsewhere and dense else []
 
 
-def _interpolation_error(
-    times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m d d"]
-) -> Float[np.ndarray, " 2"]:
+def _interpolation_error(times: Times, poses: Matrices) -> Float[np.ndarray, " 2"]:
     """The median error of a pose in the middle of two: m, rad.
 
     A pose that is interpolated over its neighbours, twice as far apart, is off by four times that.

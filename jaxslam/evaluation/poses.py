@@ -25,6 +25,7 @@ from jaxslam.evaluation.causes import causes
 from jaxslam.evaluation.convention import (
     Axes,
     Convention,
+    Squares,
     Values,
     alternatives,
     geometry_of,
@@ -46,6 +47,7 @@ from jaxslam.evaluation.inputs import (
 from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import at_one_scale, of_aligned
+from jaxslam.io.text import numbers_of
 from jaxslam.statistics.bands import Mask, PerAxis
 
 BEYOND = (
@@ -62,14 +64,6 @@ class PoseComparison(NamedTuple):
     """The names of the axes; none where they are to be found."""
     truth_sigma: tuple[float, float] | None = None
     """The σ of the true poses, m and degrees; None of exact ones."""
-
-
-class _Compared(NamedTuple):
-    """Poses along the axes used, of all steps that are not known by definition."""
-
-    found: Evaluation
-    errors: PerAxis
-    covariances: Float[np.ndarray, "runs steps m m"]
 
 
 def evaluate_poses(
@@ -119,19 +113,20 @@ def evaluate_poses(
         best = identified.nees[identified.consistent[0]]
         what = "the convention of the covariances is another"
         told = (Mistake(what, identified.sentence, best),)
-    how = {"times": at, "timed": times is not None, "identified": identified}
-    return described(found, causes=told, **how)
+    timed = times is not None
+    return described(found, causes=told, times=at, timed=timed, identified=identified)
 
 
 def as_stated(poses: Poses, asked: PoseComparison) -> Evaluation:
     """The verdict in the convention that is stated, without a look at others."""
     used, told = (asked.used, ()) if asked.used else estimated(poses, asked.align)
-    found = _compared(poses, asked._replace(used=used)).found
+    found, _, _ = _compared(poses, asked._replace(used=used))
     return described(found, notes=(*told, *found.notes))
 
 
-def _compared(poses: Poses, asked: PoseComparison) -> _Compared:
-    """The errors and covariances along the axes used, aligned, at one scale where it is free."""
+def _compared(poses: Poses, asked: PoseComparison) -> tuple[Evaluation, PerAxis, Squares]:
+    """The evaluation, errors and covariances of all steps that are not known by definition: along
+    the axes used, aligned, at one scale where it is free."""
     (align, used, truth_sigma), convention = asked, poses.convention
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
@@ -169,7 +164,7 @@ def _compared(poses: Poses, asked: PoseComparison) -> _Compared:
         scale=scale,
         truth_sigma=truth_sigma,
     )
-    return _Compared(found, errors, P)
+    return found, errors, P
 
 
 def _along(P: Values, axes: Axes) -> Values:
@@ -206,7 +201,7 @@ def _identified(poses: Poses, asked: PoseComparison) -> Identification:
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
                 other = poses._replace(convention=convention)
-                one = _tried(_compared(other, asked))
+                one = _tried(*_compared(other, asked))
                 volume = one.log_determinant - _log_volume(other)
                 result[convention] = one._replace(log_determinant=volume)
         return result
@@ -230,13 +225,12 @@ def _log_volume(poses: Poses) -> float:
     return 2 * float(volume.mean())
 
 
-def _tried(compared: _Compared) -> Tried:
+def _tried(found: Evaluation, errors: PerAxis, P: Squares) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
-    found, P = compared.found, compared.covariances
     turns = np.array([name.startswith("r") for name in found.names])
 
     def of(block: np.ndarray) -> np.ndarray:
-        z = whitened(compared.errors[..., block], P[..., block, :][..., block])
+        z = whitened(errors[..., block], P[..., block, :][..., block])
         return filled(squared(z), found.logged, np.nan)
 
     log_determinant = float(np.linalg.slogdet(P[found.logged])[1].mean())
@@ -301,15 +295,12 @@ def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
     """The σ of a truth's position (m) and of its orientation (degrees). Raises ValueError."""
     if sigma is None:
         return None
-    try:
-        told = np.asarray(sigma, np.float64)
-    except (ValueError, TypeError):
-        told = np.empty(0)
-    if told.shape != (2,) or not ((told >= 0) & (told <= LARGEST)).all():
+    told = numbers_of(sigma)
+    if len(told) != 2 or not all(0 <= x <= LARGEST for x in told):
         raise ValueError(
             f"truth_sigma must be two numbers, metres and degrees, not negative, not {sigma}"
         )
-    return float(told[0]), float(told[1])
+    return told[0], told[1]
 
 
 def with_truth(

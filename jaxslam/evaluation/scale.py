@@ -23,6 +23,7 @@ from jaxslam.evaluation.convention import (
     Convention,
     Joints,
     Matrices,
+    Squares,
     Tangents,
     pose_errors,
 )
@@ -159,10 +160,7 @@ def at_one_scale(poses: Poses, axes: Axes) -> AtScale:
 
 
 def errors_beyond_scale(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-    covariances: Float[np.ndarray, "*batch t t"],
+    convention: Convention, estimates: Matrices, truths: Matrices, covariances: Squares
 ) -> BeyondScale:
     """The part of every pose's error that is not one of scale, about the origin of the world.
 
@@ -182,11 +180,7 @@ def _affine(
     return once, pose_errors(convention, estimates, twice) - once
 
 
-def _own_scales(
-    errors: Float[np.ndarray, "*batch m"],
-    slope: Float[np.ndarray, "*batch m"],
-    covariances: Float[np.ndarray, "*batch m m"],
-) -> BeyondScale:
+def _own_scales(errors: Tangents, slope: Tangents, covariances: Squares) -> BeyondScale:
     """The scale in `SCALES` that explains each pose alone best, `ŝ = 1 − gᵀ P⁻¹ e/(gᵀ P⁻¹ g)`."""
     sigma, L = sigmas(covariances), np.linalg.cholesky(correlations(covariances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

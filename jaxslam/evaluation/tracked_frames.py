@@ -8,26 +8,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
 from jaxslam.io.text import text_lines
+from jaxslam.io.tum import Times
 
 FRAMES = "frames.csv"
 _COLUMNS = ("time", "state", "map", "unit_fixed")
 _ROW = re.compile(r"-?\d+(\.\d*)?,\w+,\d{1,6},[01]")
 _FRAME = "a finite time, a state, the number of a map, and unit_fixed 0 or 1"
-
-
-class FrameLog(NamedTuple):
-    """The log of all frames of a video, docs/gauge.md."""
-
-    times: Float[np.ndarray, " k"]
-    lost: Bool[np.ndarray, " k"]
-    maps: Int[np.ndarray, " k"]
-    """The number of the map. Each has a unit of length of its own."""
-    fixed: Bool[np.ndarray, " k"]
-    """Whether the unit of the map is fixed; before that it changes with the frames."""
 
 
 class EvaluatedPoses(NamedTuple):
@@ -40,9 +30,7 @@ class EvaluatedPoses(NamedTuple):
     """Masks of the poses of other maps, of lost frames, and from before the unit was fixed."""
 
 
-def evaluated_poses(
-    folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
-) -> EvaluatedPoses:
+def evaluated_poses(folder: Path, times: Times, known: Bool[np.ndarray, " n"]) -> EvaluatedPoses:
     """The poses at these times that the tracker's file in the folder leaves to be evaluated.
 
     They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
@@ -54,16 +42,16 @@ def evaluated_poses(
     frames = read_frames(path)
     if frames is None:
         return EvaluatedPoses(np.ones(len(times), bool), 0, {})
-    order = np.argsort(frames.times, kind="stable")
-    place = np.interp(times, frames.times[order], np.arange(len(order)))
+    order = np.argsort(frames[0], kind="stable")
+    place = np.interp(times, frames[0][order], np.arange(len(order)))
     nearest = order[np.rint(place).astype(int)]
-    away = np.abs(frames.times[nearest] - times)
+    at, lost, maps, fixed = (x[nearest] for x in frames)
+    away = np.abs(at - times)
     if away.max() > MAX_TIME_DIFFERENCE:
         raise ValueError(
             f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
             f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
         )
-    _, lost, maps, fixed = (x[nearest] for x in frames)
     usable = fixed & ~lost
     if not usable.any():
         raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
@@ -78,8 +66,9 @@ def evaluated_poses(
     return EvaluatedPoses(own & ~lost & ~opening, number, others)
 
 
-def read_frames(path: Path) -> FrameLog | None:
-    """Read the file of a tracker; None where there is none, or another one of its name.
+def read_frames(path: Path) -> tuple[np.ndarray, ...] | None:
+    """The times of a tracker's frames, which are lost, their maps, and whether the unit of those is
+    fixed (docs/gauge.md); None where there is no file of it, or another one of its name.
 
     Raises ValueError, naming the line, for what a tracker does not write.
     """
@@ -96,4 +85,4 @@ def read_frames(path: Path) -> FrameLog | None:
         if len(row) != len(titles) or not _ROW.fullmatch(",".join(row[i] for i in columns)):
             raise ValueError(f"{path}, line {line}: expected {_FRAME}")
     time, state, number, fixed = np.array(rows)[:, columns].T
-    return FrameLog(time.astype(float), state == "lost", number.astype(int), fixed == "1")
+    return time.astype(float), state == "lost", number.astype(int), fixed == "1"

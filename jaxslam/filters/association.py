@@ -47,11 +47,11 @@ matches."""
 class Candidates(NamedTuple):
     """m matches of p numbers each, as innovations of one predicted Gaussian."""
 
-    residual: Float[Array, "m p"]
-    covariance: Float[Array, "m p m p"]
+    residual: Float[AnyArray, "m p"]
+    covariance: Float[AnyArray, "m p m p"]
     """S of all."""
-    valid: Bool[Array, " m"]
-    landmark: Int[Array, " m"]
+    valid: Bool[AnyArray, " m"]
+    landmark: Int[AnyArray, " m"]
     """The landmark of which each is a match: a number below m."""
 
     @property

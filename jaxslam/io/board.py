@@ -62,22 +62,19 @@ class Board:
         return points.astype(np.float32)
 
     @cached_property
-    def _charuco(self) -> cv2.aruco.CharucoBoard:
+    def _detector(self) -> cv2.aruco.CharucoDetector:
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}")
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         size = (self.columns, self.rows)
         # Side of a ChArUco marker, in squares.
-        return cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
-
-    @cached_property
-    def _detector(self) -> cv2.aruco.CharucoDetector:
-        return cv2.aruco.CharucoDetector(self._charuco)
+        board = cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
+        return cv2.aruco.CharucoDetector(board)
 
     def drawn(self, pixels: int = 100) -> UInt8[np.ndarray, "h w"]:
         """The board to print, a square of so many pixels, with a white margin of one square."""
         size = (self.columns * pixels, self.rows * pixels)
         if self.kind == "charuco":
-            board = self._charuco.generateImage(size)
+            board = self._detector.getBoard().generateImage(size)
         else:
             dark = np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2 == 0
             board = np.kron(np.where(dark, 0, 255), np.ones((pixels, pixels))).astype(np.uint8)

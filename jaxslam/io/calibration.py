@@ -52,17 +52,13 @@ class Calibration:
 
     def __post_init__(self) -> None:
         for key in _KEYS:
-            _require_number(key, getattr(self, key))
-        for key in ("width", "height"):
-            value = getattr(self, key)
-            if value != int(value):
+            value, kind = getattr(self, key), float if key in INTRINSICS else int
+            _require_number(key, value)
+            if value != kind(value):
                 raise ValueError(f"{key} must be a whole number of pixels, not {value}")
-            object.__setattr__(self, key, int(value))
-        for key in INTRINSICS:
-            object.__setattr__(self, key, float(getattr(self, key)))
-        for key in ("width", "height", "fx", "fy"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be positive, not {getattr(self, key)}")
+            if value <= 0 and key not in ("cx", "cy"):
+                raise ValueError(f"{key} must be positive, not {value}")
+            object.__setattr__(self, key, kind(value))
         object.__setattr__(self, "distortion", _padded(self.model, self.distortion))
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
 

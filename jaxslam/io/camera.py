@@ -1,9 +1,10 @@
 """A live camera: `0` is the first that the system has."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
 
 import numpy as np
 
@@ -32,49 +33,36 @@ class Live:
 
     def images(self) -> Iterator[Image]:
         """Pictures as they come. Raises ValueError where none comes for `PATIENCE` seconds."""
+        changed, over = Condition(), Event()
+        newest: deque[tuple[float, np.ndarray]] = deque(maxlen=1)
+
         with opened(self.number) as capture:
+
+            def fetch() -> None:
+                while not over.is_set():
+                    found, image = capture.read()
+                    with changed:
+                        if found and image is not None:
+                            newest.append((time.monotonic(), image))
+                        else:
+                            over.set()
+                        changed.notify()
+
             begun = time.monotonic()
-            newest = _Newest(capture.read)
+            thread = Thread(target=fetch, daemon=True)
+            thread.start()
             try:
                 while True:
-                    came, image = newest.wait(self.number)
+                    with changed:
+                        changed.wait_for(lambda: newest or over.is_set(), PATIENCE)
+                        if not newest:
+                            raise ValueError(f"camera {self.number} delivers no pictures")
+                        came, image = newest.pop()
                     self._came = came - begun
                     yield as_grey(image)
             finally:
-                newest.stop()
-
-
-class _Newest:
-    """The newest picture that is read, taken once."""
-
-    def __init__(self, read: Callable[[], tuple[bool, np.ndarray | None]]) -> None:
-        self._changed = Condition()
-        self._picture: tuple[float, np.ndarray] | None = None
-        self._running = True
-        self._thread = Thread(target=self._fetch, args=(read,), daemon=True)
-        self._thread.start()
-
-    def wait(self, number: int) -> tuple[float, np.ndarray]:
-        with self._changed:
-            self._changed.wait_for(lambda: self._picture or not self._running, PATIENCE)
-            picture, self._picture = self._picture, None
-        if picture is None:
-            raise ValueError(f"camera {number} delivers no pictures")
-        return picture
-
-    def stop(self) -> None:
-        self._running = False
-        self._thread.join(PATIENCE)
-
-    def _fetch(self, read: Callable[[], tuple[bool, np.ndarray | None]]) -> None:
-        while self._running:
-            found, image = read()
-            with self._changed:
-                if image is not None and found:
-                    self._picture = time.monotonic(), image
-                else:
-                    self._running = False
-                self._changed.notify()
+                over.set()
+                thread.join(PATIENCE)
 
 
 def _open(path: Path, _rate: float) -> Recording:

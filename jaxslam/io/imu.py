@@ -52,6 +52,10 @@ _UNITS = ((r"m(dps|deg.*)", np.pi / 180e3), (r"dps|deg.*|°.*", np.pi / 180),
 """Units of readings that a title says, in rad/s and m/s²."""
 
 
+Rows = Float[np.ndarray, "_ 7"]
+"""Rows `t, gyroscope, accelerometer`."""
+
+
 class InertialLog(NamedTuple):
     """The readings of an IMU in its own axes, at increasing times."""
 
@@ -176,10 +180,7 @@ def _first(table: Sequence[tuple[str, float]], word: str) -> float | None:
 
 
 def inertial_log(
-    name: str,
-    rows: Float[np.ndarray, "n 7"],
-    ticks: float | None = None,
-    notes: tuple[str, ...] = (),
+    name: str, rows: Rows, ticks: float | None = None, notes: tuple[str, ...] = ()
 ) -> InertialLog:
     """The log of rows `t, gyroscope, accelerometer`, checked. A second has so many `ticks` of `t`;
     None are as many as an IMU has between 10 Hz and 10 kHz.
@@ -211,9 +212,7 @@ def inertial_log(
     return InertialLog(times, rows[:, 1:4], rows[:, 4:], name, said)
 
 
-def _increasing(
-    name: str, rows: Float[np.ndarray, "n 7"]
-) -> tuple[Float[np.ndarray, "m 7"], tuple[str, ...]]:
+def _increasing(name: str, rows: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The finite rows whose times come after all before, and what was left out."""
     count, whole = len(rows), rows[np.isfinite(rows).all(axis=1)]
     latest = np.maximum.accumulate(np.r_[-np.inf, whole[:-1, 0]])[: len(whole)]

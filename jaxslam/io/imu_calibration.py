@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.imu import InertialLog, inertial_files
-from jaxslam.io.lens_files import numbers_of, yaml_keys
-from jaxslam.io.text import text_lines
+from jaxslam.io.lens_files import yaml_keys
+from jaxslam.io.text import numbers_of, text_lines
 from jaxslam.io.tum import not_rigid
 
 _APART = 5.0

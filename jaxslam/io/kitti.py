@@ -21,7 +21,8 @@ from jaxslam.io.recording import (
     of_files,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.text import numbers, read_table, text_lines
+from jaxslam.io.text import read_table, rows_of, text_lines
+from jaxslam.io.tum import Times, transforms
 
 CAMERAS = ("0", "2")
 
@@ -39,7 +40,7 @@ def _open(path: Path, _rate: float) -> Recording:
     return of_files(path, files, times, calibration, reference)
 
 
-def _read_times(path: Path) -> Float[np.ndarray, " n"]:
+def _read_times(path: Path) -> Times:
     expected = "finite times in seconds"
     table = read_table(path, "times", "times", expected)
     times = table.numbers(expected, [0])[:, 0]
@@ -52,12 +53,11 @@ def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
     for number, line in text_lines(path).items():
         name, _, rest = line.partition(":")
         if name.strip() == f"P{camera}":
-            told, place = numbers(rest.split(), 12), f"{path}, line {number}"
-            if told is None:
-                raise ValueError(f"{place}: expected P{camera}: and twelve numbers")
-            P = np.array(told).reshape(3, 4)
+            told = rows_of(path, {number: rest.split()}, 12, f"P{camera}: and twelve numbers")
+            P = told.reshape(3, 4)
             if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
-                raise ValueError(f"{place}: not a projection matrix with a positive focal length")
+                wrong = "not a projection matrix with a positive focal length"
+                raise ValueError(f"{path}, line {number}: {wrong}")
             return P
     raise ValueError(f"{path} has no line P{camera}: for the images in image_{camera}")
 
@@ -74,15 +74,12 @@ def _poses_of(path: Path) -> tuple[Path, Path]:
     return path / "poses.txt", sequence.parent.parent / "poses" / f"{sequence.name}.txt"
 
 
-def _camera_truth(
-    path: Path, times: Float[np.ndarray, " n"], P: Float[np.ndarray, "3 4"] | None
-) -> Trajectory:
+def _camera_truth(path: Path, times: Times, P: Float[np.ndarray, "3 4"] | None) -> Trajectory:
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
     row = "12 finite numbers, the rows of a 3x4 T_wc"
     rows = read_table(path, "poses", "poses", row).numbers(row, range(12)).reshape(-1, 3, 4)
     _check_count(path, len(rows), len(times))
-    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3] = rows
+    T_wc = transforms(rows[:, :, :3], rows[:, :, 3])
     check_rigid(path, T_wc)
     if P is not None:
         T_wc[:, :3, 3] -= rows[:, :, :3] @ np.linalg.solve(P[:, :3], P[:, 3])

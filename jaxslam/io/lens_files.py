@@ -6,10 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from jaxslam.io.calibration import INTRINSICS, Calibration, from_fields
-from jaxslam.io.text import numbers, text_lines
+from jaxslam.io.text import numbers, numbers_of, text_lines
 
 _MODELS = {
     **dict.fromkeys(("pinhole", "plumb_bob", "radtan", "radial-tangential", "opencv", "none"), ""),
@@ -155,14 +153,3 @@ def _flat(fields: dict[str, object], before: str = "") -> dict[str, object]:
 
 def _first(fields: dict[str, object], names: Sequence[str]) -> list[float]:
     return next((found for name in names if (found := numbers_of(fields.get(name)))), [])
-
-
-def numbers_of(told: object) -> list[float]:
-    """The numbers of a word, or of a list of any depth; none of anything else."""
-    if isinstance(told, str):
-        words = told.strip("[]").replace(",", " ").split()
-        return numbers(words, len(words)) or []
-    try:
-        return np.asarray(told, float).ravel().tolist() if told is not None else []
-    except (ValueError, TypeError):
-        return []

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
@@ -37,6 +38,11 @@ class Table(NamedTuple):
         """Name a row by file and line."""
         return f"{self.path}, line {self.lines[row]}"
 
+    def check(self, wrong: ArrayLike, expected: str) -> None:
+        """Raise ValueError for the first row that is wrong, with what is expected there."""
+        for row in np.flatnonzero(wrong)[:1]:
+            raise ValueError(f"{self.place(row)}: expected {expected}")
+
     def numbers(
         self, expected: str, columns: Sequence[int] = (), *, spare: bool = True
     ) -> Float[np.ndarray, "n m"]:
@@ -49,9 +55,7 @@ class Table(NamedTuple):
         if max(columns) >= count or not (spare or len(columns) == count):
             raise ValueError(f"{self.place(0)}: expected {expected}")
         found = self.rows[:, columns]
-        wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
-        if wrong.size:
-            raise ValueError(f"{self.place(wrong[0])}: expected {expected}")
+        self.check(~np.isfinite(found).all(axis=1), expected)
         return found
 
 
@@ -116,9 +120,10 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
                 raise ValueError(f"{path}, line {number}: expected {row}")
             values.append(value)
         rows.append(values)
-    told_words = {i: tuple(column) for i, column in words.items()}
-    table = Table(Path(path), (*comments, *named), titles, np.array(rows), tuple(lines), told_words)
-    return _without_index(table)
+    index = int(titles[:1] == ("",))  # a first column without a title, as of pandas
+    by_column = {i - index: tuple(column) for i, column in words.items()}
+    values = np.array(rows)[:, index:]
+    return Table(Path(path), (*comments, *named), titles[index:], values, tuple(lines), by_column)
 
 
 def cells(line: str, separator: str | None = "?", titles: int = 0) -> list[str]:
@@ -167,20 +172,32 @@ def _titles(lines: Sequence[str], count: int) -> tuple[str, ...]:
     return ()
 
 
-def _without_index(table: Table) -> Table:
-    """Leave out a first column without a title, as of pandas."""
-    if not table.titles or table.titles[0]:
-        return table
-    words = {i - 1: column for i, column in table.words.items()}
-    return table._replace(titles=table.titles[1:], rows=table.rows[:, 1:], words=words)
+def numbers(told: Sequence[str], count: int) -> list[float] | None:
+    """Read words as `count` finite numbers; None if they are not."""
+    found = [x for word in told if (x := _number(word)) is not None and math.isfinite(x)]
+    return found if len(found) == len(told) == count else None
 
 
-def numbers(told: Sequence[str], count: int, *, finite: bool = True) -> list[float] | None:
-    """Read words as `count` numbers, finite unless that is not asked for; None if they are not."""
-    found = [_number(word) for word in told]
-    if len(found) != count or any(x is None or (finite and not math.isfinite(x)) for x in found):
-        return None
-    return [x for x in found if x is not None]
+def rows_of(
+    path: Path, told: Mapping[int, Sequence[str]], count: int, expected: str
+) -> Float[np.ndarray, "n count"]:
+    """The words of lines, by their numbers, as `count` numbers each. Raises ValueError, naming the
+    line."""
+    rows = {line: numbers(words, count) for line, words in told.items()}
+    for line in (line for line, row in rows.items() if row is None):
+        raise ValueError(f"{path}, line {line}: expected {expected}")
+    return np.array(list(rows.values())).reshape(-1, count)
+
+
+def numbers_of(told: object) -> list[float]:
+    """The numbers of a word, or of a list of any depth; none of anything else."""
+    if isinstance(told, str):
+        words = told.strip("[]").replace(",", " ").split()
+        return numbers(words, len(words)) or []
+    try:
+        return np.asarray(told, float).ravel().tolist() if told is not None else []
+    except (ValueError, TypeError, OverflowError):
+        return []
 
 
 def _number(cell: str) -> float | None:

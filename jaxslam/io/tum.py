@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam.io.text import read_table
 
+Times = Float[np.ndarray, " n"]
+"""Times of poses or of other rows, s, or in a unit yet to be found."""
+
 
 def quaternions(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Return rotation matrices as quaternions x, y, z, w, of which w is not negative."""
@@ -25,10 +28,14 @@ def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n
     from scipy.spatial.transform import Rotation  # slow to import
 
     rotation = Rotation.from_quat(np.asarray(quaternion, dtype=float).reshape(-1, 4))
-    result = np.tile(np.eye(4), (len(rotation), 1, 1))
-    result[:, :3, :3] = rotation.as_matrix()
-    result[:, :3, 3] = translation
-    return result
+    return transforms(rotation.as_matrix(), np.broadcast_to(translation, (len(rotation), 3)))
+
+
+def transforms(R: Float[np.ndarray, "*n 3 3"], p: np.ndarray) -> Float[np.ndarray, "*n 4 4"]:
+    """Matrices [R p; 0 1] of rotations and of positions, (…, 3) or (…, 3, 1)."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, p.reshape(*R.shape[:-1]), 1.0
+    return T
 
 
 def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:

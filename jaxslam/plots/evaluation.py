@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -83,10 +84,7 @@ def plot_nees(
     style = line_style(place)
     _band(evaluation, ax)
     ax.axhline(evaluation.dof, color=GREY, lw=0.8)
-    marker = "o" if evaluation.steps == 1 else None
-    ax.plot(evaluation.times, evaluation.mean, lw=1.8, marker=marker, **style)
-    if label is not None:
-        label_end(ax, End(label, evaluation.times, evaluation.mean, style["color"]))
+    _line(evaluation, ax, evaluation.mean, label, **style)
     ax.set_yscale("log")
     bottom, top = ax.get_ylim()
     ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
@@ -138,12 +136,9 @@ def plot_axis(
     evaluation: Evaluation, axis: int, *, ax: Axes, label: str | None = None, place: int = 0
 ) -> Axes:
     """RMSE (solid) and claimed σ (dashed) of one axis over time."""
-    colour, marker = line_style(place)["color"], "o" if evaluation.steps == 1 else None
-    rmse, sigma = evaluation.rmse[:, axis], evaluation.sigma[:, axis]
-    ax.plot(evaluation.times, rmse, lw=1.8, color=colour, marker=marker)
-    ax.plot(evaluation.times, sigma, lw=1.4, ls="--", color=colour, marker=marker)
-    if label is not None:
-        label_end(ax, End(label, evaluation.times, rmse, colour))
+    colour = line_style(place)["color"]
+    _line(evaluation, ax, evaluation.rmse[:, axis], label, color=colour)
+    _line(evaluation, ax, evaluation.sigma[:, axis], None, color=colour, lw=1.4, ls="--")
     ax.set_ylim(bottom=0)
     if evaluation.convention is not None:
         length = "m" if evaluation.scale is None else "map units"
@@ -163,10 +158,7 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
     (low, high), median, sigma = evaluation.scale.over_runs
     percent = 100 * np.expm1(np.clip([low, median, high], -_MOST_LOG, _MOST_LOG))
     ax.fill_between(evaluation.times, percent[0], percent[2], color=COLOURS[0], alpha=0.25, lw=0)
-    marker = "o" if evaluation.steps == 1 else None
-    ax.plot(evaluation.times, percent[1], lw=1.8, color=COLOURS[0], marker=marker)
-    if label is not None:
-        label_end(ax, End(label, evaluation.times, percent[1], COLOURS[0]))
+    _line(evaluation, ax, percent[1], label, color=COLOURS[0])
     claimed = 100 * np.expm1(np.clip([-2 * sigma, 2 * sigma], -_MOST_LOG, _MOST_LOG))
     ax.plot(evaluation.times, claimed.T, lw=1.4, ls="--", color=COLOURS[1])
     shown = np.abs([*percent, *claimed])
@@ -175,6 +167,21 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
     ax.set_ylabel("% off its run's")
     set_title(ax, "scale: median, 95 % of runs; ±2σ claimed (dashed)")
     return _over_time(evaluation, ax)
+
+
+def _line(
+    evaluation: Evaluation,
+    ax: Axes,
+    values: np.ndarray,
+    label: str | None,
+    lw: float = 1.8,
+    **style: Any,
+) -> None:
+    """Draw values over time, a dot where there is one step, and the label at their end."""
+    marker = "o" if evaluation.steps == 1 else None
+    ax.plot(evaluation.times, values, lw=lw, marker=marker, **style)
+    if label is not None:
+        label_end(ax, End(label, evaluation.times, values, style["color"]))
 
 
 def _over_time(evaluation: Evaluation, ax: Axes) -> Axes:

@@ -22,6 +22,8 @@ _LABELS = {
     "cartesian": "Cartesian",
 }
 Limits = tuple[float, float]
+Distributions = dict[str, Samples]
+Styles = dict[str, LineStyle]
 
 
 def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -> Figure:
@@ -35,7 +37,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     distributions = {**comparison.truth, **comparison.estimates}
     low, high = _limits(distributions, {name: of.z for name, of in distributions.items()})
     depths = max(low, -views.depth), min(high, 4 * views.depth)
-    styles: dict[str, LineStyle] = {
+    styles: Styles = {
         _TRUTH: {"color": GREY, "linestyle": "-"},
         "posterior": {"color": "black", "linestyle": (0, (1, 1.5))},
     }
@@ -75,7 +77,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     return save(figure, path)
 
 
-def _limits(of: dict[str, Samples], values: dict[str, Float[np.ndarray, " n"]]) -> Limits:
+def _limits(of: Distributions, values: dict[str, Float[np.ndarray, " n"]]) -> Limits:
     """An interval that holds nearly all of every distribution that is not beyond infinity."""
     ends = []
     for name, value in values.items():
@@ -86,11 +88,7 @@ def _limits(of: dict[str, Samples], values: dict[str, Float[np.ndarray, " n"]]) 
 
 
 def _plot_plane(
-    axes: Axes,
-    distributions: dict[str, Samples],
-    point: Limits,
-    depths: Limits,
-    styles: dict[str, LineStyle],
+    axes: Axes, distributions: Distributions, point: Limits, depths: Limits, styles: Styles
 ) -> None:
     """Regions of 50 % and 95 % in the second camera."""
     offsets = {}

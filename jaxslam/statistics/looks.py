@@ -8,6 +8,7 @@ of the scatter is as wide as the runs themselves scatter, whatever they are draw
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -265,10 +266,7 @@ def _enough(least_dof: float, dof: float, level: float) -> int:
         high = TOLERANCE**2 - _unseen(dof, dof, runs)
         return total + error <= least * high and most <= TOLERANCE**2 * (total - error)
 
-    low, high = 0, 1
+    high = 1
     while not told(high):
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if told(middle) else (middle, high)
-    return high
+        high *= 2
+    return bisect_left(range(high), True, lo=high // 2 + 1, key=told)

@@ -47,7 +47,7 @@ class Tally:
     """Time averages of the runs never lost."""
     fitted: float = 0.0
     """The degrees of freedom, from 0 to so many, that a fit to the run took from every NEES."""
-    thirds: tuple[PowerSums, PowerSums, PowerSums] = (PowerSums(), PowerSums(), PowerSums())
+    thirds: tuple[PowerSums, ...] = (PowerSums(), PowerSums(), PowerSums())
     """Averages over each third of the steps, of the runs that did not diverge and have three."""
 
     @staticmethod
@@ -89,8 +89,8 @@ class Tally:
         """Return the tally that `asdict` wrote; one written without thirds has none."""
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
-        first, second, last = (PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
-        return Tally(*counts, *sums, numbers.get("fitted", 0.0), (first, second, last))
+        thirds = tuple(PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
+        return Tally(*counts, *sums, numbers.get("fitted", 0.0), thirds)
 
     @staticmethod
     def of_numbers(numbers: Float[np.ndarray, " 27"], dof: int, fitted: float = 0.0) -> Tally:
@@ -99,9 +99,8 @@ class Tally:
         average, end, never_lost, *thirds = (
             PowerSums(int(n), *map(float, rest)) for n, *rest in numbers[3:].reshape(6, 4)
         )
-        first, second, last = thirds
         counts = dof, runs, diverged, lost
-        return Tally(*counts, average, end, never_lost, fitted, (first, second, last))
+        return Tally(*counts, average, end, never_lost, fitted, tuple(thirds))
 
     def numbers(self) -> Float[np.ndarray, " 27"]:
         """Return all that adds up, for `of_numbers`."""
@@ -114,15 +113,11 @@ class Tally:
         return asdict(self) | {"thirds": [asdict(third) for third in self.thirds]}
 
     def __add__(self, other: Tally) -> Tally:
-        if self.dof != other.dof:
-            raise ValueError(
-                f"runs with {self.dof} and {other.dof} degrees of freedom cannot be pooled"
-            )
-        if self.fitted != other.fitted:
-            raise ValueError(
-                f"runs with {self.fitted} and {other.fitted} fitted degrees of freedom cannot be "
-                "pooled"
-            )
+        both = (self.dof, other.dof, ""), (self.fitted, other.fitted, "fitted ")
+        for own, theirs, what in both:
+            if own != theirs:
+                told = f"runs with {own} and {theirs} {what}degrees of freedom"
+                raise ValueError(f"{told} cannot be pooled")
         return Tally.of_numbers(self.numbers() + other.numbers(), self.dof, self.fitted)
 
     def looks(self) -> list[Look]:
@@ -212,11 +207,7 @@ def _logged(nees: PerStep, logged: Mask | None) -> Mask:
     return there
 
 
-def lost_runs(
-    nees: Float[np.ndarray, "runs steps"],
-    dof: int,
-    logged: Bool[np.ndarray, "runs steps"] | None = None,
-) -> list[int]:
+def lost_runs(nees: PerStep, dof: int, logged: Mask | None = None) -> list[int]:
     """The numbers of the runs lost at any of their steps; for `logged` see `Tally.of`.
 
     Of right runs one in 10 000 is lost, or fewer, however many steps they have. Raises ValueError
@@ -228,15 +219,13 @@ def lost_runs(
     return [int(run) for run in np.flatnonzero((~(nees <= limits[:, None]) & there).any(axis=1))]
 
 
-def _thirds(nees: PerStep, there: Mask) -> tuple[PowerSums, PowerSums, PowerSums]:
+def _thirds(nees: PerStep, there: Mask) -> tuple[PowerSums, ...]:
     """The power sums of the averages over each third of the steps that are there."""
     steps = there.sum(axis=1)
     long, place = steps >= len(THIRDS), np.cumsum(there, axis=1) - 1
     which = np.where(there, len(THIRDS) * place // steps[:, None], -1)[long]
-    first, second, last = (
-        PowerSums.of(nees[long].mean(axis=1, where=which == third)) for third in range(len(THIRDS))
-    )
-    return first, second, last
+    each = (which == third for third in range(len(THIRDS)))
+    return tuple(PowerSums.of(nees[long].mean(axis=1, where=those)) for those in each)
 
 
 def run_verdict(
@@ -418,9 +407,7 @@ def _digits(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
-def innovation_verdict(
-    nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"], dof: int
-) -> Verdict:
+def innovation_verdict(nis: PerStep, normalised: PerAxis, dof: int) -> Verdict:
     """The verdict on innovations, of every step where they seem white, else of every run.
 
     It is that of `run_verdict`; `samples` says whether steps or runs are counted. Innovations,
@@ -445,7 +432,6 @@ def _of_steps(nis: PerStep, dof: int, outlying: list[int]) -> Tally:
     """A tally to which every step is a run, but for the counts of runs."""
     there = ~np.isnan(nis)
     third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // there.sum(axis=1, keepdims=True)
-    first, second, last = (PowerSums.of(nis[there & (third == i)]) for i in range(len(THIRDS)))
     kept = np.ones(len(nis), bool)
     kept[outlying] = False
     at_end = nis[range(len(nis)), nis.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)]
@@ -457,5 +443,5 @@ def _of_steps(nis: PerStep, dof: int, outlying: list[int]) -> Tally:
         average=PowerSums.of(nis[there]),
         end=PowerSums.of(at_end),
         never_lost=PowerSums.of(nis[there & kept[:, None]]),
-        thirds=(first, second, last),
+        thirds=tuple(PowerSums.of(nis[there & (third == i)]) for i in range(len(THIRDS))),
     )

@@ -12,6 +12,10 @@ _CELLS = (8, 6)  # columns and rows of the grid that corners are spread over
 _BLOCK = 5  # side of the window that a corner's strength is summed over, in pixels
 
 
+Corners = Float32[np.ndarray, "_ 2"]
+"""Pixels (u, v) as OpenCV has them."""
+
+
 def bare_corners(
     image: Picture, settings: TrackerSettings, occupied: Pixels | None = None
 ) -> Places:
@@ -28,7 +32,7 @@ def bare_corners(
 
 def detect_corners(
     image: Picture, count: int, *, occupied: Pixels, min_distance: float, border: int
-) -> Float32[np.ndarray, "n 2"]:
+) -> Corners:
     """Return up to `count` new Shi-Tomasi corners (n, 2), sub-pixel, spread over the image.
 
     Each one is the strongest of the cell of a grid that holds fewest points so far, `occupied`
@@ -54,7 +58,7 @@ def detect_corners(
     return chosen
 
 
-def _candidates(image: Picture, border: int) -> Float32[np.ndarray, "n 2"]:
+def _candidates(image: Picture, border: int) -> Corners:
     """Whole pixels (n, 2) of corners at least `border` pixels inside, the strongest first."""
     strength = cv2.cornerMinEigenVal(image, _BLOCK)
     peaks = strength == cv2.dilate(strength, np.ones((5, 5), np.uint8))
@@ -68,9 +72,7 @@ def _candidates(image: Picture, border: int) -> Float32[np.ndarray, "n 2"]:
     return corners[_within(corners, image.shape, border)]
 
 
-def _refined(
-    image: Picture, corners: Float32[np.ndarray, "n 2"], border: int
-) -> Float32[np.ndarray, "m 2"]:
+def _refined(image: Picture, corners: Corners, border: int) -> Corners:
     """The corners sub-pixel, but for those that then are within `border` pixels of the edge."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 15, 0.01)
     refined = cv2.cornerSubPix(image, corners[:, None].copy(), (4, 4), (-1, -1), criteria)[:, 0]
@@ -79,19 +81,17 @@ def _refined(
     return refined[_within(refined, image.shape, border)]
 
 
-def _within(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...], border: int) -> np.ndarray:
+def _within(points: Corners, shape: tuple[int, ...], border: int) -> np.ndarray:
     return np.all((points >= border) & (points <= np.array(shape[1::-1]) - 1 - border), axis=1)
 
 
-def _farther(
-    points: Float32[np.ndarray, "n 2"], others: Float32[np.ndarray, "k 2"], distance: float
-) -> np.ndarray:
+def _farther(points: Corners, others: Corners, distance: float) -> np.ndarray:
     """Return whether each point is as far as that from all others."""
     x, y = (points[:, None, i] - others[:, i] for i in (0, 1))
     return np.all(x * x + y * y >= distance**2, axis=1)
 
 
-def _cell(points: Float32[np.ndarray, "n 2"], scale: Float[np.ndarray, " 2"]) -> np.ndarray:
+def _cell(points: Corners, scale: Float[np.ndarray, " 2"]) -> np.ndarray:
     """The number of each point's cell; points outside the image count for the nearest cell."""
     column, row = np.clip((points * scale).astype(int), 0, np.array(_CELLS) - 1).T
     return row * _CELLS[0] + column

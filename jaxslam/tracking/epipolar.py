@@ -2,10 +2,11 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.optics import on_pinhole
+from jaxslam.tracking.pose_with_covariance import Places
 
 MINIMAL = 5
 """Matches through which there always is an essential matrix."""
@@ -13,11 +14,8 @@ CONFIDENCE = 0.9999
 
 
 def of_one_motion(
-    before: Float[np.ndarray, "m 2"],
-    now: Float[np.ndarray, "m 2"],
-    calibration: Calibration,
-    sigma: float,
-) -> Bool[np.ndarray, " m"]:
+    before: Places, now: Places, calibration: Calibration, sigma: float
+) -> Bool[np.ndarray, " n"]:
     """Return those near the epipolar lines of the essential matrix with the most of them near, by
     MAGSAC++ (Barath et al., CVPR 2020) in OpenCV; `sigma` is a pixel's. None of fewer than six,
     and none far from the axis of a fisheye.

@@ -6,7 +6,6 @@ Features beyond those that there are have no valid pixel, so that no frame compi
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -48,7 +47,7 @@ from jaxslam.tracking.inertial import Inertial
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
-from jaxslam.tracking.pose_with_covariance import Pixels, Positions, Spreads, Transform
+from jaxslam.tracking.pose_with_covariance import Depths, Pixels, Positions, Spreads, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -114,12 +113,8 @@ class Estimator:
     inertial: Inertial | None = None
     """What tells the motion, if anything does."""
 
-    @classmethod
-    def of(
-        cls, slam: AbstractStaged, settings: TrackerSettings, inertial: Inertial | None = None
-    ) -> Estimator:
-        """With the filter's numbers in 64 bits."""
-        return cls(cast(slam, jnp.float64), settings, inertial)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "slam", cast(self.slam, jnp.float64))
 
     def empty(self, before: Belief | None = None) -> Belief:
         """The state of a map without landmarks, whose inertial unit goes on as `before`."""
@@ -149,24 +144,19 @@ class Estimator:
         return Predicted(control, state, gaussian, joint, view)
 
     def believes(
-        self,
-        predicted: Predicted,
-        slots: Int[np.ndarray, " m"],
-        matches: Matches,
-        wide: Association | None = None,
+        self, predicted: Predicted, slots: Slots, matches: Matches, wide: Association | None = None
     ) -> Bool[np.ndarray, " m"]:
         """Return which matches, of landmarks in these slots, agree, by an association for `wide`
         ellipses or the settings'."""
         association = ASSOCIATIONS[self.settings.association] if wide is None else wide
         found = self.candidates(predicted, slots, matches, curved=wide is not None)
-        believed = _believed(association, *self._of_fixed_size(*found, wide is not None))
+        believed = _believed(association, self._of_fixed_size(found, several=wide is not None))
         return np.asarray(believed)[: len(slots)]
 
     def candidates(
         self, predicted: Predicted, slots: Int[np.ndarray, " m"], matches: Matches, *, curved: bool
-    ) -> tuple[np.ndarray, ...]:
-        """Return the innovations of matches, as `Candidates` has them: residuals, covariance, and
-        which are valid; and their slots."""
+    ) -> Candidates:
+        """Return the innovations of matches, and their slots as landmarks."""
         R, i = self.settings.pixel_sigma**2 * np.eye(2), np.arange(len(slots))
         S = predicted.joint[slots][:, :, slots]
         same = slots[:, None] == slots
@@ -178,7 +168,7 @@ class Estimator:
         more = self.settings.noise_factors(matches.variances) - 1 + self.settings.tolerance**2
         S[i, :, i] += more[:, None, None] * R
         view = predicted.view
-        return matches.pixels - view.pixels[slots], S, view.usable[slots], slots
+        return Candidates(matches.pixels - view.pixels[slots], S, view.usable[slots], slots)
 
     def nis(self, predicted: Predicted, seen: Observations) -> tuple[float, int]:
         """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
@@ -243,11 +233,7 @@ class Estimator:
         return _at_rest(self.slam, state)
 
     def begin(
-        self,
-        state: Belief,
-        slots: Slots,
-        pixels: Pixels,
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, state: Belief, slots: Slots, pixels: Pixels, depths: Depths | None = None
     ) -> tuple[Belief, CameraReport]:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
@@ -293,10 +279,10 @@ class Estimator:
             return Predicted(still, ahead, gaussian, joint, Prediction(*view))
 
         def believed(association: Association | None) -> None:
-            nothing = np.zeros((0, 2)), np.zeros((0, 2, 0, 2)), np.zeros(0, bool), np.zeros(0, int)
-            several = association is not None
+            S, slots, several = np.zeros((0, 2, 0, 2)), np.zeros(0, int), association is not None
+            nothing = Candidates(np.zeros((0, 2)), S, np.zeros(0, bool), slots)
             one = association or ASSOCIATIONS[self.settings.association]
-            _believed.compile(one, *self._of_fixed_size(*nothing, several))
+            _believed.compile(one, self._of_fixed_size(nothing, several=several))
             if several:
                 _curved.compile(slam, *predicted()[1:3], still)
 
@@ -319,22 +305,17 @@ class Estimator:
             ),
         ]
 
-    def _of_fixed_size(
-        self,
-        residual: Float[np.ndarray, "m 2"],
-        covariance: Float[np.ndarray, "m 2 m 2"],
-        valid: Bool[np.ndarray, " m"],
-        slots: Int[np.ndarray, " m"],
-        several: bool,
-    ) -> tuple[np.ndarray, ...]:
-        """Return the parts of `Candidates`, as many as there can be: those added are not valid."""
-        m, size = len(slots), self.settings.wanted * (PEAKS if several else 1)
+    def _of_fixed_size(self, found: Candidates, *, several: bool) -> Candidates:
+        """Return as many as there can be, by their landmarks: those added are not valid."""
+        slots, m = found.landmark, len(found.landmark)
+        size = self.settings.wanted * (PEAKS if several else 1)
         padded = np.tile(np.eye(2)[:, None], (size, 1, size, 1)) * np.eye(size)[:, None, :, None]
-        padded[:m, :, :m] = covariance
+        padded[:m, :, :m] = found.covariance
         landmark = np.argmax(slots == slots[:, None], axis=1) if m else slots
         more = (0, size - m)
         landmark = np.pad(landmark, more, constant_values=size - 1)
-        return np.pad(residual, (more, (0, 0))), padded, np.pad(valid, more), landmark
+        residual, valid = np.pad(found.residual, (more, (0, 0))), np.pad(found.valid, more)
+        return Candidates(residual, padded, valid, landmark)
 
     def _innovations(
         self, predicted: Predicted, seen: Observations
@@ -347,12 +328,7 @@ class Estimator:
         return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
-        self,
-        create: Callable[..., tuple[Belief, Report]],
-        state: Belief,
-        slots: Slots,
-        pixels: Pixels,
-        *depths: PyTree,
+        self, create: Program, state: Belief, slots: Slots, pixels: Pixels, *depths: PyTree
     ) -> tuple[Belief, CameraReport]:
         new = _padded(slots, pixels, self.settings.wanted)
         state, found = create(self.slam, state, new, *depths)
@@ -460,14 +436,8 @@ def _predict(
 
 
 @Program
-def _believed(
-    association: Association,
-    residual: jax.Array,
-    covariance: jax.Array,
-    valid: jax.Array,
-    landmark: jax.Array,
-) -> Bool[jax.Array, " m"]:
-    return association(Candidates(residual, covariance, valid, landmark))
+def _believed(association: Association, found: Candidates) -> Bool[jax.Array, " m"]:
+    return association(found)
 
 
 @Program

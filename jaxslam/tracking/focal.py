@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from jaxslam._runtime.files import Json
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.optics import sighted
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.report import History
 
 CLEAR = 0.8
 """The share of the squares that is left where another lens fits clearly better."""
@@ -50,7 +49,7 @@ class BetterLens(NamedTuple):
         }
 
 
-def better_lens(history: Sequence[Tracked], points: Points, calibration: Calibration) -> BetterLens:
+def better_lens(history: History, points: Points, calibration: Calibration) -> BetterLens:
     """Adjust views of three stretches of the video with the points that they share, from where the
     tracker has both, with the lens that was given and with focal length and k1 free."""
     squares, information, weighed = np.zeros(2), np.eye(2) / _PRIOR**2, np.zeros(2)
@@ -85,7 +84,7 @@ class _Bundle(NamedTuple):
     given: Calibration
 
     @classmethod
-    def of(cls, seen: Sequence[Tracked], points: Points, calibration: Calibration) -> _Bundle:
+    def of(cls, seen: History, points: Points, calibration: Calibration) -> _Bundle:
         """The points that three views share and all have before them, from the first view."""
         sights = [one.sights for one in seen]
         count = sum((np.isin(points.numbers, list(those)) for those in sights), 0 * points.numbers)

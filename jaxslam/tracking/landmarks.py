@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -61,6 +62,10 @@ class Landmark:
         return replace(self, success=success, missed=0, unseen=0, seen_at=pixel, found=count)
 
 
+Landmarks = Mapping[int, Landmark]
+"""Landmarks by their slots of a filter's map, or by their numbers."""
+
+
 class Points(NamedTuple):
     """n landmarks in the world, as they were seen last."""
 
@@ -75,12 +80,3 @@ class Points(NamedTuple):
     """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
     in_map: np.ndarray
     """The same given where the map begins, (n, 3, 3)."""
-
-    def only(self, which: np.ndarray) -> Points:
-        """Some of them, in the order given."""
-        return Points(*(part[which] for part in self))
-
-
-def joined(parts: list[Points]) -> Points:
-    """Several as one; there is at least one."""
-    return Points(*(np.concatenate(of_all) for of_all in zip(*parts, strict=True)))

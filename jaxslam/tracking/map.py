@@ -16,8 +16,8 @@ from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.motion import Control
 from jaxslam.tracking.estimator import Estimator, Predicted
-from jaxslam.tracking.landmarks import Landmark, Points, joined
-from jaxslam.tracking.observations import Observations, Slots
+from jaxslam.tracking.landmarks import Landmark, Landmarks, Points
+from jaxslam.tracking.observations import Observations, Slots, joined, only
 from jaxslam.tracking.patches import Patch, Picture
 from jaxslam.tracking.places.descriptors import with_looks
 from jaxslam.tracking.places.submaps import (
@@ -28,7 +28,7 @@ from jaxslam.tracking.places.submaps import (
     compile_graph,
     handed_over,
 )
-from jaxslam.tracking.pose_with_covariance import Pixels
+from jaxslam.tracking.pose_with_covariance import Depths, Pixels
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import Join, MapInWorld, Nearness, nearness
 
@@ -47,7 +47,7 @@ class Map:
 
     state: Belief
     place: MapInWorld = field(default_factory=MapInWorld)
-    landmarks: Mapping[int, Landmark] = field(default_factory=dict)
+    landmarks: Landmarks = field(default_factory=dict)
     """Those in the map, by their slot of the state."""
     number: int = 0
     """The number of the map, from 0."""
@@ -130,7 +130,7 @@ class TrackerState:
     """The greatest number of a submap so far."""
     finished: tuple[Points, ...] = ()
     """Landmarks that left their maps."""
-    charted: Mapping[int, Landmark] = field(default_factory=dict)
+    charted: Landmarks = field(default_factory=dict)
     """The landmarks of all submaps that ended, by their numbers, as they were last."""
     seen: Map | None = None
     """The map as it was last seen, while the camera is lost and its unit is fixed."""
@@ -138,7 +138,7 @@ class TrackerState:
     """The other maps that were left, the latest last."""
 
     @property
-    def landmarks(self) -> Mapping[int, Landmark]:
+    def landmarks(self) -> Landmarks:
         """The landmarks in the map, by their slot of the filter's state."""
         return self.map.landmarks
 
@@ -152,7 +152,7 @@ class TrackerState:
         """The number of landmarks so far."""
         return self.deleted + len(self.landmarks)
 
-    def described(self) -> Mapping[int, Landmark]:
+    def described(self) -> Landmarks:
         """Return the landmarks of all maps that are known, by their numbers."""
         latest = [one for known in self.known() for one in known.landmarks.values()]
         return {**self.charted, **{one.number: one for one in latest}}
@@ -187,9 +187,7 @@ class TrackerState:
         vain = failing(landmarks, self.estimator.settings)
         return self.with_map(landmarks=landmarks).given_up(vain)
 
-    def begun(
-        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> TrackerState:
+    def begun(self, image: Picture, pixels: Pixels, depths: Depths | None = None) -> TrackerState:
         """Landmarks at these pixels begin a map that has none; `depths` as `Estimator`'s."""
         slots = self._free(len(pixels))
         state, report = self.estimator.begin(self.map.state, slots, pixels, depths)
@@ -265,7 +263,7 @@ class TrackerState:
             now = replace(now, latest_submap=number)
             found = replace(found, earlier=(*known.earlier, known), submap=number)
         back = [one.number for one in found.landmarks.values()]
-        finished = tuple(points.only(~np.isin(points.numbers, back)) for points in now.finished)
+        finished = tuple(only(points, ~np.isin(points.numbers, back)) for points in now.finished)
         return replace(now, map=found, left=left, seen=None, finished=finished)
 
     def fallen_back(self, predicted: Predicted) -> TrackerState:
@@ -322,7 +320,7 @@ class TrackerState:
         points = self._recorded(slots.tolist())
         some = [self.landmarks[slot] for slot in slots.tolist()]
         worst = worst_first(some, points, self.estimator.settings)[:missing]
-        return self.given_up(slots[worst].tolist(), points.only(worst))
+        return self.given_up(slots[worst].tolist(), only(points, worst))
 
     def _free(self, count: int) -> Int[np.ndarray, " n"]:
         """The first free slots."""
@@ -356,7 +354,7 @@ class TrackerState:
         return Points(numbers, maps, submaps, *self.map.place.points(points, covariances))
 
 
-def slot_numbers(landmarks: Mapping[int, Landmark], capacity: int) -> Int[np.ndarray, " slots"]:
+def slot_numbers(landmarks: Landmarks, capacity: int) -> Int[np.ndarray, " slots"]:
     """Return the numbers of the landmarks in the slots, −1 for none."""
     numbers = np.full(capacity, -1)
     numbers[list(landmarks)] = [one.number for one in landmarks.values()]
@@ -364,7 +362,7 @@ def slot_numbers(landmarks: Mapping[int, Landmark], capacity: int) -> Int[np.nda
 
 
 def in_view(
-    landmarks: Mapping[int, Landmark], slots: Sequence[int] | np.ndarray, settings: TrackerSettings
+    landmarks: Landmarks, slots: Sequence[int] | np.ndarray, settings: TrackerSettings
 ) -> Bool[np.ndarray, " k"]:
     """Return which of the slots hold landmarks that are found, but for a few searches at most.
 
@@ -375,7 +373,7 @@ def in_view(
 
 
 def note_found(
-    landmarks: Mapping[int, Landmark], seen: Observations, settings: TrackerSettings
+    landmarks: Landmarks, seen: Observations, settings: TrackerSettings
 ) -> dict[int, Landmark]:
     """Return the landmarks after a search, that matched some of them.
 
@@ -388,7 +386,7 @@ def note_found(
     return noted
 
 
-def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> list[int]:
+def failing(landmarks: Landmarks, settings: TrackerSettings) -> list[int]:
     """Slots of landmarks that are searched in vain of late."""
     return [slot for slot, one in landmarks.items() if one.success < settings.least_success]
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from jaxslam.tracking.observations import Slots
+from jaxslam.tracking.observations import Slots, joined, only
 from jaxslam.tracking.patches import Picture, Window
 from jaxslam.tracking.pose_with_covariance import Pixels, Places
 
@@ -49,10 +49,6 @@ class Matches(NamedTuple):
     variances: Float[np.ndarray, " m"]
     """The variance of each pixel's u and v, pixels², as the difference of the two windows tells
     (`refine`)."""
-
-    def only(self, which: np.ndarray) -> "Matches":
-        """Some of them."""
-        return Matches(*(part[which] for part in self))
 
     def first_of_each(
         self, count: int
@@ -93,12 +89,12 @@ def match_patches(
     wide = boxes.owner[boxes.large()]
     boxes = _narrowed(image, templates, ellipses, boxes, least)
     peaks = _peaks(whole, templates, boxes, least)
-    peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
-    peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
+    peaks = only(peaks, ellipses.hold(peaks.owner, peaks.pixels))
+    peaks = only(peaks, np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    both = _alone(peaks.only(~in_wide)), _several(peaks.only(in_wide))
-    chosen = _Peaks(*map(np.concatenate, zip(*both, strict=True)))
-    chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
+    both = _alone(only(peaks, ~in_wide)), _several(only(peaks, in_wide))
+    chosen = joined(both)
+    chosen = only(chosen, np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
     if len(pixels):
@@ -106,17 +102,11 @@ def match_patches(
     return Matches(chosen.owner, pixels, chosen.scores, variances)
 
 
-class Fit(NamedTuple):
-    """How n templates fit a picture."""
-
-    pixels: Places
-    """Where, sub-pixel."""
-    variances: Float[np.ndarray, " n"]
-    """The variance of each pixel's u and v, pixels²."""
-
-
-def refine(image: Grey, templates: Windows, pixels: Places) -> Fit:
-    """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
+def refine(
+    image: Grey, templates: Windows, pixels: Places
+) -> tuple[Places, Float[np.ndarray, " n"]]:
+    """The places near `pixels` to which affine maps fit templates best, by Gauss-Newton, and the
+    variance of each pixel's u and v, pixels².
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
     gain and offset do not matter), with a prior on the map: the identity, with a σ of `_MAP_SIGMA`.
@@ -145,7 +135,7 @@ def refine(image: Grey, templates: Windows, pixels: Places) -> Fit:
     maps = np.where(gone[:, None, None], identity, maps)
     windows, likeness = known.compared(image, places, maps)
     s2 = 2 * np.maximum(1 - likeness, 0.0) / windows.shape[1]
-    return Fit(places, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2)
+    return places, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2
 
 
 class _Templates(NamedTuple):
@@ -243,16 +233,13 @@ class _Boxes(NamedTuple):
         """Columns and rows."""
         return self.high - self.low + 1
 
-    def only(self, which: np.ndarray) -> "_Boxes":
-        return _Boxes(*(part[which] for part in self))
-
     def large(self) -> Bool[np.ndarray, " m"]:
         """The patches that are first searched in the picture of half the size."""
         return self.sizes.prod(axis=1) > _NARROW
 
     def large_enough(self) -> "_Boxes":
         """Return those of three pixels each way: a peak needs a neighbour on either side."""
-        return self.only(np.all(self.sizes >= 3, axis=1))
+        return only(self, np.all(self.sizes >= 3, axis=1))
 
 
 def _boxes_around(ellipses: _Ellipses, half: int, shape: tuple[int, ...]) -> _Boxes:
@@ -275,9 +262,6 @@ class _Peaks(NamedTuple):
     scores: Float32[np.ndarray, " k"]
     around: Float32[np.ndarray, "k 9"]
 
-    def only(self, which: np.ndarray) -> "_Peaks":
-        return _Peaks(*(part[which] for part in self))
-
 
 def _peaks(image: Grey, templates: Windows, boxes: _Boxes, least: float) -> _Peaks:
     """The local maxima within each box, its rim excluded, that reach `least`."""
@@ -296,17 +280,17 @@ def _peaks(image: Grey, templates: Windows, boxes: _Boxes, least: float) -> _Pea
     row, column, box, at = row[inner], column[inner], box[inner], at[inner]
     around = sheet[row[:, None] + _DOWN, column[:, None] + _RIGHT]
     found = _Peaks(boxes.owner[box], boxes.low[box] + at, around[:, 4], around)
-    return found.only(found.scores == around.max(axis=1))
+    return only(found, found.scores == around.max(axis=1))
 
 
 def _alone(peaks: _Peaks) -> _Peaks:
     """The best peak of each patch, of those that have one which is high enough and alone; of peaks
     in order of patches, best first."""
     _, first, of = np.unique(peaks.owner, return_index=True, return_inverse=True)
-    best = peaks.only(first)
+    best = only(peaks, first)
     apart = (np.abs(peaks.pixels - best.pixels[of]) > _APART).any(axis=1)
     rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - AMBIGUITY)]
-    return best.only((best.scores >= THRESHOLD) & ~np.isin(best.owner, rivals))
+    return only(best, (best.scores >= THRESHOLD) & ~np.isin(best.owner, rivals))
 
 
 def _several(peaks: _Peaks) -> _Peaks:
@@ -322,7 +306,7 @@ def _several(peaks: _Peaks) -> _Peaks:
             and np.abs(peaks.pixels[better] - pixel).max(axis=1).min() > _APART
         ):
             kept.append(i)
-    return peaks.only(np.array(kept, int))
+    return only(peaks, np.array(kept, int))
 
 
 def _narrowed(
@@ -336,10 +320,9 @@ def _narrowed(
     # Of score: what a match loses at half the size, where pixels fall otherwise
     small = [
         halved.places(templates[box.owner[0]], box, ellipses, least - 0.1)
-        for box in (boxes.only(index) for index in np.flatnonzero(large)[:, None])
+        for box in (only(boxes, index) for index in np.flatnonzero(large)[:, None])
     ]
-    parts = [boxes.only(~large), *small]
-    return _Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return joined([only(boxes, ~large), *small])
 
 
 class _Halved(NamedTuple):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.tracking.pose_with_covariance import Pixels
 
+Table = TypeVar("Table", bound=tuple[Any, ...])
+"""A named tuple of columns, each with as many rows."""
 Slots = Int[np.ndarray, " k"]
 """The slots of k landmarks in the filter's map."""
 
@@ -31,6 +34,23 @@ class Lost(StrEnum):
     """What the filter makes of the frame is no number."""
     REVERSED = "reversed"
     """Most of the map turned out to be behind the camera."""
+
+
+def only(table: Table, which: np.ndarray) -> Table:
+    """Some rows of a table, in the order given."""
+    return type(table)(*(column[which] for column in table))
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Several tables, at least one, as one."""
+    return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
+
+
+def distances(
+    off: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+) -> Float[np.ndarray, " k"]:
+    """Squared distances `νᵀ S⁻¹ ν`."""
+    return np.einsum("ki,ki->k", off, np.linalg.solve(covariances, off[..., None])[..., 0])
 
 
 class Prediction(NamedTuple):
@@ -84,11 +104,7 @@ class Observations(NamedTuple):
 
     def labelled(self, label: str) -> Observations:
         """The rows of one label."""
-        return self.only(self.labels == label)
-
-    def only(self, which: np.ndarray) -> Observations:
-        """Some of the rows."""
-        return Observations(*(part[which] for part in self))
+        return only(self, self.labels == label)
 
     def with_new(self, pixels: Float[np.ndarray, "j 2"]) -> Observations:
         """The table and below it landmarks that begin at these pixels, `new`: nothing was expected
@@ -97,7 +113,7 @@ class Observations(NamedTuple):
         nowhere, nothing = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
         labels = np.full(count, "new")
         new = Observations(np.full(count, -1), nowhere, nothing, pixels, np.zeros(count), labels)
-        return Observations(*map(np.concatenate, zip(self, new, strict=True)))
+        return joined([self, new])
 
     def but_for(self, used: Bool[np.ndarray, " k"]) -> Observations:
         """The table in which matches that the filter did not use are outliers."""

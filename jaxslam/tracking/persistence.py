@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import Join, MapInWorld
 
 FORMAT = "jaxslam tracker 10"
+Header = Mapping[str, Json]
+"""Words and numbers, as JSON has them."""
+Arrays = Mapping[str, np.ndarray]
 
 _RECORDS: tuple[type, ...] = (
     TrackerState, Map, MapInWorld, PoseWithCovariance, Landmark, Patch, Points, Submap,
@@ -43,14 +46,13 @@ def save(
 ) -> None:
     """Write a tracker, whole or not at all, with the name of a filter beyond the settings."""
     writer = _Writer()
-    written = writer.written(state)
-    arrays = [one.written for one in writer.arrays.values()]
+    written, arrays = writer.written(state), writer.arrays
     header = {
         "calibration": as_fields(state.calibration),
         "settings": asdict(settings),
         "filter": filter_name,
         "state": written,
-        "records": [one.written for one in writer.records.values()],
+        "records": writer.records,
         "arrays": [[x.dtype.name, x.shape] for x in arrays],
     }
     flat: dict[str, list[np.ndarray]] = {}
@@ -59,38 +61,33 @@ def save(
     write_record(path, header, {name: np.concatenate(some) for name, some in flat.items()})
 
 
-class _Written(NamedTuple):
-    """What is written of a value, which is kept: another could have its identity."""
-
-    value: object
-    place: int
-    written: Json
-
-
 @dataclass
 class _Writer:
     """Makes JSON of values, and gathers the records and arrays to which it refers."""
 
-    records: dict[int, _Written] = field(default_factory=dict)
-    """By their identities."""
-    arrays: dict[int, _Written] = field(default_factory=dict)
+    records: list[Json] = field(default_factory=list)
+    arrays: list[np.ndarray] = field(default_factory=list)
+    places: dict[int, tuple[int, object]] = field(default_factory=dict)
+    """Where each is of its kind, by its identity, and itself: another could have that."""
 
     def written(self, value: object) -> Json:
         """The value: a record or an array by its place, a tuple as a list, a mapping as pairs."""
         if isinstance(value, _RECORDS):
-            if id(value) not in self.records:
+            if id(value) not in self.places:
                 # What it refers to comes before it.
                 record = {name: self._field(value, name) for name in _names(type(value))}
-                written = [type(value).__name__, record]
-                self.records[id(value)] = _Written(value, len(self.records), written)
-            return {"record": self.records[id(value)].place}
+                self.places[id(value)] = len(self.records), value
+                self.records.append([type(value).__name__, record])
+            return {"record": self.places[id(value)][0]}
         if isinstance(value, Mapping):
             return {"pairs": [[self.written(key), self.written(x)] for key, x in value.items()]}
         if isinstance(value, tuple):
             return [self.written(x) for x in value]
         if isinstance(value, np.ndarray | jax.Array):
-            written = _Written(value, len(self.arrays), np.asarray(value))
-            return {"array": self.arrays.setdefault(id(value), written).place}
+            if id(value) not in self.places:
+                self.places[id(value)] = len(self.arrays), value
+                self.arrays.append(np.asarray(value))
+            return {"array": self.places[id(value)][0]}
         return value.item() if isinstance(value, np.generic) else value
 
     def _field(self, record: object, name: str) -> Json:
@@ -133,9 +130,7 @@ def load(
 class _Reader:
     """Makes of what was written what it was, of a tracker that begins with the state `new`."""
 
-    def __init__(
-        self, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray], new: TrackerState
-    ) -> None:
+    def __init__(self, header: Header, arrays: Arrays, new: TrackerState) -> None:
         self._new, self._like = new, {"state": new.map.state}
         ends = dict.fromkeys(arrays, 0)
         self._arrays: list[np.ndarray] = []
@@ -175,9 +170,7 @@ class _Reader:
         return jax.tree.unflatten(structure, [jnp.asarray(x) for x in value])
 
 
-def write_record(
-    path: str | Path, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray]
-) -> None:
+def write_record(path: str | Path, header: Header, arrays: Arrays) -> None:
     """Write both as one .npz archive, whole or not at all. Numbers keep their last digit."""
     text = json.dumps({"format": FORMAT, **header})
     with write_atomically(path) as temporary, temporary.open("wb") as file:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import write_text
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.logs.log import symmetric
 from jaxslam.tracking.optics import sighted
 from jaxslam.tracking.pose_with_covariance import Places, Positions, Spreads, Transform
 
@@ -80,9 +81,7 @@ def read_ply(path: str | Path) -> Cloud:
     table = table.reshape(-1, len(_PROPERTIES) + 2) if not table.size else table
     if named != [*_PROPERTIES, "id", "map"] or table.shape[1:] != (len(named),):
         raise ValueError(f"{path} is not a map.ply as jaxslam track writes it")
-    covariances = np.zeros((len(table), 3, 3))
-    upper = np.triu_indices(3)
-    covariances[:, *upper] = covariances[:, *upper[::-1]] = table[:, 3:9]
+    covariances = symmetric(table[:, 3:9], np.transpose(np.triu_indices(3)), 3)
     return Cloud(table[:, :3], covariances, table[:, 9].astype(int), table[:, 10].astype(int))
 
 

@@ -3,7 +3,7 @@ contradict what the map has proven."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,10 +15,10 @@ from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ran
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.estimator import Estimator, Predicted
-from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.landmarks import Landmark, Landmarks
 from jaxslam.tracking.map import TrackerState
 from jaxslam.tracking.matching import GATE, Matches
-from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
+from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots, distances, only
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
@@ -111,7 +111,7 @@ class Policy:
         self,
         seen: Observations,
         matches: Matches,
-        landmarks: Mapping[int, Landmark],
+        landmarks: Landmarks,
         agree: Agreement,
         *,
         lost: bool,
@@ -128,7 +128,7 @@ class Policy:
             chosen = self._of_several(seen.slots, matches, landmarks, agree, least)
         else:
             chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches))
-        agreed, variances = matches.only(chosen).first_of_each(rows)
+        agreed, variances = only(matches, chosen).first_of_each(rows)
         believed = np.isfinite(agreed[:, 0])
         if believed.sum() < least:
             believed[:] = False
@@ -146,22 +146,20 @@ class Policy:
         sigma = 1.5 + turned @ turned / (2 * self.calibration.fx)
         return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
 
-    def _likely_given_proven(
-        self, seen: Observations, landmarks: Mapping[int, Landmark], nis: Surprise
-    ) -> bool:
+    def _likely_given_proven(self, seen: Observations, landmarks: Landmarks, nis: Surprise) -> bool:
         """Return whether what is matched of landmarks that are not proven is likely, all together,
         given what is matched of those that are: each by itself may be within its gate, and all of
         them be moved alike."""
         matched = seen.labelled("matched")
         whole, dof = nis(matched)
-        old, known = nis(matched.only(proven(matched.slots, landmarks)))
+        old, known = nis(only(matched, proven(matched.slots, landmarks)))
         asked = 2 * LEAST_MATCHES <= known < dof
         return not asked or bool(chi2.sf(whole - old, dof - known) > TOGETHER)
 
     def reason(
         self,
         seen: Observations,
-        landmarks: Mapping[int, Landmark],
+        landmarks: Landmarks,
         agree: Agreement,
         nis: Surprise,
         *,
@@ -173,7 +171,7 @@ class Policy:
             return Lost.NOTHING_EXPECTED, doubtful
         if not seen.matched.any():
             return Lost.FEW_AGREE, doubtful
-        known = seen.only(proven(seen.slots, landmarks))
+        known = only(seen, proven(seen.slots, landmarks))
         agreed = known.labelled("matched")
         few = len(agreed.slots) <= MOST * len(known.slots)
         another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
@@ -194,12 +192,7 @@ class Policy:
         return bool(agree(others.slots, matches).sum() >= least)
 
     def _of_several(
-        self,
-        slots: Slots,
-        matches: Matches,
-        landmarks: Mapping[int, Landmark],
-        agree: Agreement,
-        least: int,
+        self, slots: Slots, matches: Matches, landmarks: Landmarks, agree: Agreement, least: int
     ) -> Int[np.ndarray, " m"]:
         """Return those that agree, of landmarks with several places each, if they are `least` at
         least.
@@ -210,11 +203,11 @@ class Policy:
         """
         for association in self.in_wide:
             places = np.flatnonzero(agree(slots[matches.owner], matches, association))
-            some = matches.only(places)
+            some = only(matches, places)
             lately, rigid = self._rigid([landmarks[slots[row]] for row in some.owner], some.pixels)
             tested = places[_alone(some.owner, rigid | ~lately)]
             rigid = np.isin(tested, places[rigid])
-            linear = agree(slots[matches.owner[tested]], matches.only(tested))
+            linear = agree(slots[matches.owner[tested]], only(matches, tested))
             predictable = 2 * (linear & rigid).sum() >= rigid.sum()
             best = tested[linear if predictable else rigid]
             if len(best) >= least + (0 if predictable else MINIMAL):
@@ -247,10 +240,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     """Return whether a linear prediction given what is believed explains most of that."""
     slots = seen.slots[seen.matched]
     off = seen.pixels[seen.matched] - given.pixels[slots]
-    weighted = np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
-    squared = np.einsum("ki,ki->k", off, weighted)
     # The share that a linear prediction must explain for that second search.
-    return bool(np.mean(squared < GATE) > 0.8)
+    return bool(np.mean(distances(off, given.covariances[slots]) < GATE) > 0.8)
 
 
 def more_than_chance(searched: int, chance: float = CHANCE) -> int:
@@ -265,13 +256,13 @@ def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[n
     return some[count[of] == 1]
 
 
-def proven(slots: Slots, landmarks: Mapping[int, Landmark]) -> Bool[np.ndarray, " k"]:
+def proven(slots: Slots, landmarks: Landmarks) -> Bool[np.ndarray, " k"]:
     """Return which of the slots hold landmarks that are proven."""
     return np.array([landmarks[slot].found >= PROVEN for slot in slots], bool)
 
 
 def _of_proven(
-    landmarks: Mapping[int, Landmark],
+    landmarks: Landmarks,
     agree: Agreement,
     slots: Int[np.ndarray, " m"],
     matches: Matches,
@@ -280,5 +271,5 @@ def _of_proven(
     """Return which matches of proven landmarks agree; none of the others does."""
     believed = proven(slots, landmarks)
     old = np.flatnonzero(believed)
-    believed[old] = agree(slots[old], matches.only(old), *association)
+    believed[old] = agree(slots[old], only(matches, old), *association)
     return believed

@@ -11,14 +11,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.evaluation.convention import lever
+
 Transform = Float[np.ndarray, "4 4"]
 """A pose as a matrix."""
+Transforms = Float[np.ndarray, "n 4 4"]
+"""Poses as matrices."""
 Pixels = Float[np.ndarray, "k 2"]
 """Pixels (u, v) of k landmarks."""
 Places = Float[np.ndarray, "n 2"]
 """Pixels (u, v) of n points."""
 Positions = Float[np.ndarray, "n 3"]
 """n points."""
+Depths = tuple[np.ndarray, np.ndarray]
+"""Means and σ of 1/z of n points, (n, 1)."""
 Spreads = Float[np.ndarray, "n 3 3"]
 """Their covariances."""
 
@@ -69,7 +75,7 @@ class PoseWithCovariance:
         """
         R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
         with np.errstate(invalid="ignore", over="ignore"):  # a point at infinity stays there
-            J = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross(points)], axis=2)
+            J = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), lever(points)], axis=2)
             total = covariances + J @ self.covariance @ np.swapaxes(J, 1, 2)
             return points @ R.T + t, R @ total @ R.T
 
@@ -77,7 +83,7 @@ class PoseWithCovariance:
 def adjoint(T: Transform) -> Float[np.ndarray, "6 6"]:
     """`Ad(T)`, with `T Exp(e) = Exp(Ad(T) e) T`: `[[R, [t]× R], [0, R]]`, position first."""
     R = T[:3, :3]
-    return np.block([[R, _cross(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])
+    return np.block([[R, -lever(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])
 
 
 def carried(P: Float[np.ndarray, "6 6"], T: Transform) -> Float[np.ndarray, "6 6"]:
@@ -90,8 +96,3 @@ def positive(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the nearest symmetric matrix that has no negative eigenvalue."""
     values, vectors = np.linalg.eigh((P + P.T) / 2)
     return P if values[0] >= 0 else (vectors * np.maximum(values, 0)) @ vectors.T
-
-
-def _cross(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """`[v]×`, the matrix of the cross product with v from the left."""
-    return -np.cross(v[..., None, :], np.eye(3))

@@ -16,7 +16,7 @@ from jaxslam.io.source import Frame
 from jaxslam.io.tum import tum_text
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.observations import NOTHING, Lost, Observations, distances
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 
@@ -118,9 +118,7 @@ class Tracked:
         for agreement: of two degrees of freedom each where the prediction is right."""
         seen = self.observations
         found = np.isfinite(seen.pixels[:, 0])
-        off = (seen.pixels - seen.predicted)[found]
-        weighted = np.linalg.solve(seen.covariances[found], off[..., None])[..., 0]
-        return np.einsum("ki,ki->k", off, weighted)
+        return distances((seen.pixels - seen.predicted)[found], seen.covariances[found])
 
     @property
     def state(self) -> str:
@@ -128,7 +126,11 @@ class Tracked:
         return "start" if self.starts else "lost" if self.lost else "tracked"
 
 
-def trajectory_text(history: Sequence[Tracked]) -> str:
+History = Sequence[Tracked]
+"""What became of the frames so far."""
+
+
+def trajectory_text(history: History) -> str:
     """The poses of all frames in TUM format. All of a map are in one unit of length
     (docs/gauge.md), and the header says so."""
     poses = np.stack([result.T_wc for result in history])
@@ -136,7 +138,7 @@ def trajectory_text(history: Sequence[Tracked]) -> str:
     return tum_text(times, poses, "in the unit of each map (frames.csv)")
 
 
-def frames_text(history: Sequence[Tracked]) -> str:
+def frames_text(history: History) -> str:
     """What became of every frame, as CSV.
 
     `state` is `start` of a map (lost too, unless it is the first), `tracked` or `lost`. `map` is
@@ -163,7 +165,7 @@ TEXTS = {"trajectory.txt": trajectory_text, "frames.csv": frames_text}
 """Files that grow with every frame."""
 
 
-def add_latest(out: Path, history: Sequence[Tracked]) -> None:
+def add_latest(out: Path, history: History) -> None:
     """Add the latest frame to the files in a folder, which are whole at any time; an interruption
     of the first two leaves none."""
     for name, text in TEXTS.items():

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.landmarks import Landmarks
 from jaxslam.tracking.map import in_view
 from jaxslam.tracking.matching import Matches, match_patches
 from jaxslam.tracking.observations import Observations, Prediction, Slots
@@ -19,7 +17,7 @@ from jaxslam.tracking.settings import TrackerSettings
 
 def search(
     image: Picture,
-    landmarks: Mapping[int, Landmark],
+    landmarks: Landmarks,
     prediction: Prediction,
     calibration: Calibration,
     settings: TrackerSettings,
@@ -47,7 +45,7 @@ def search(
 
 
 def to_search(
-    landmarks: Mapping[int, Landmark],
+    landmarks: Landmarks,
     prediction: Prediction,
     calibration: Calibration,
     settings: TrackerSettings,
@@ -74,10 +72,7 @@ def to_search(
 
 
 def changes_of_view(
-    landmarks: Mapping[int, Landmark],
-    prediction: Prediction,
-    slots: Slots,
-    calibration: Calibration,
+    landmarks: Landmarks, prediction: Prediction, slots: Slots, calibration: Calibration
 ) -> Float[np.ndarray, "k 2 2"]:
     """Return how the picture around each landmark changed since its first view; zero where it
     cannot be determined.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.slam import Slam
 from jaxslam.models.frame import Robocentric, Submaps
-from jaxslam.tracking.pose_with_covariance import Places
+from jaxslam.tracking.pose_with_covariance import Depths, Places
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation
 
@@ -51,7 +51,7 @@ def _handing_over(made: AbstractStaged) -> AbstractStaged:
 
 def places_with_target(
     seen: TargetObservation, corners: Places, settings: TrackerSettings
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+) -> tuple[np.ndarray, Depths]:
     """Return pixels to start landmarks at, of a target's points first and of the corners away from
     them; and mean and σ of 1/z of as many as are wanted."""
     s, others = settings, settings.wanted - len(seen.sigma)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 
@@ -19,7 +18,8 @@ from jaxslam.io.calibration import INTRINSICS, MODELS, Calibration, as_fields
 from jaxslam.io.source import Source, Trajectory
 from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.observations import only
+from jaxslam.tracking.report import History
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import as_summary
 from jaxslam.tracking.tracker import Tracker
@@ -42,11 +42,7 @@ Summary = dict[str, Json]
 
 
 def summarised(
-    source: Source,
-    tracker: Tracker,
-    history: Sequence[Tracked],
-    points: Points,
-    seconds: list[float],
+    source: Source, tracker: Tracker, history: History, points: Points, seconds: list[float]
 ) -> Summary:
     """Summarise the frames, and the landmarks as they are known at the end."""
     lost = sum(result.lost for result in history)
@@ -181,16 +177,16 @@ def describe(summary: Summary) -> str:
     return "\n".join(lines)
 
 
-def known_points(landmarks: Points, history: Sequence[Tracked]) -> Points:
+def known_points(landmarks: Points, history: History) -> Points:
     """The landmarks whose depth became known in their maps."""
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
         # A point is put into the map where its σ is below this share of its distance.
         known = np.isfinite(sigma) & (sigma < 0.3 * _distances(landmarks, history))
-    return landmarks.only(known)
+    return only(landmarks, known)
 
 
-def _distances(landmarks: Points, history: Sequence[Tracked]) -> Float[np.ndarray, " n"]:
+def _distances(landmarks: Points, history: History) -> Float[np.ndarray, " n"]:
     """Return distances to the nearest camera of their map; zero of a landmark that is nowhere."""
     cameras = trajectory_of(history).T_wc[:, :3, 3]
     maps = np.array([result.map for result in history])
@@ -202,13 +198,13 @@ def _distances(landmarks: Points, history: Sequence[Tracked]) -> Float[np.ndarra
     return distances
 
 
-def trajectory_of(history: Sequence[Tracked]) -> Trajectory:
+def trajectory_of(history: History) -> Trajectory:
     """The poses of the frames at their times."""
     times = np.array([result.time for result in history])
     return Trajectory(times, np.stack([result.T_wc for result in history]))
 
 
-def reference_in_map(source: Source, history: Sequence[Tracked]) -> np.ndarray | None:
+def reference_in_map(source: Source, history: History) -> np.ndarray | None:
     """Return what of the reference is of the time of these frames, (m, 4, 4), aligned as for its
     error."""
     if source.reference is None:
@@ -231,7 +227,7 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     return math.sqrt(2) * float(settings.depth.sigma / settings.depth.mean)
 
 
-def _units(history: Sequence[Tracked]) -> list[Summary]:
+def _units(history: History) -> list[Summary]:
     """Return, for every map, the frame from which on the filter's unit was fixed, and the log of
     the map's unit in metres as believed at its end, with σ; null where there is no doubt."""
     units = []
@@ -259,9 +255,7 @@ def _unit_line(unit: Summary) -> str:
     )
 
 
-def _calibration(
-    tracker: Tracker, lens: Summary, history: Sequence[Tracked], points: Points
-) -> Summary:
+def _calibration(tracker: Tracker, lens: Summary, history: History, points: Points) -> Summary:
     """Return what the camera was taken for, and where it is estimated or considered, what it is in
     the end with σ: what is considered was found by the start, and left since. Where it is known,
     the lens that fits much better, if one does."""
@@ -310,7 +304,7 @@ def _better(better: Summary, given: Summary) -> str:
     )
 
 
-def _ungated(updates: Sequence[Tracked]) -> Summary:
+def _ungated(updates: History) -> Summary:
     """Return what the predictions are worth: squared innovations of all that was found, wrong
     matches and all, by the median of χ² of 2 degrees of freedom, and the share beyond its 95 %."""
     squared = np.concatenate([np.zeros(0), *(result.innovations for result in updates)])
@@ -323,7 +317,7 @@ def _ungated(updates: Sequence[Tracked]) -> Summary:
     }
 
 
-def trajectory_errors(source: Source, history: Sequence[Tracked]) -> Summary:
+def trajectory_errors(source: Source, history: History) -> Summary:
     """The trajectory error, where there is a reference, or why it cannot be computed."""
     if source.reference is None:
         return {}

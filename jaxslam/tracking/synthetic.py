@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Image, Source, Trajectory
+from jaxslam.io.tum import transforms
 from jaxslam.tracking.patches import Picture
-from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform
+from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform, Transforms
 
 NOISE = 2.0  # standard deviation of the sensor noise, in grey levels
 SUPERSAMPLING = 2
@@ -71,9 +72,7 @@ def synthetic_source(
     return Source(f"synthetic (seed {seed})", calibration, times, images, Trajectory(times, T_wc))
 
 
-def handheld_trajectory(
-    times: Float[np.ndarray, " n"], seed: int = 0
-) -> Float[np.ndarray, "n 4 4"]:
+def handheld_trajectory(times: Float[np.ndarray, " n"], seed: int = 0) -> Transforms:
     """Poses T_wc (n, 4, 4) at times in seconds: swaying sideways, with all six degrees of freedom.
 
     Sums of two sinusoids for each of x, y, z (m) and the rotation vector (rad), shifted so that
@@ -88,10 +87,7 @@ def handheld_trajectory(
     phase[0, 0] = rng.uniform(-0.5, 0.5)  # starts at full speed sideways
     angle = 2 * np.pi * np.asarray(times, dtype=float)[:, None, None] / period + phase
     motion = np.sum(amplitude * (np.sin(angle) - np.sin(phase)), axis=1)
-    T_wc = np.tile(np.eye(4), (len(motion), 1, 1))
-    T_wc[:, :3, :3] = Rotation.from_rotvec(motion[:, 3:]).as_matrix()
-    T_wc[:, :3, 3] = motion[:, :3]
-    return T_wc
+    return transforms(Rotation.from_rotvec(motion[:, 3:]).as_matrix(), motion[:, :3])
 
 
 def render(quads: Sequence[Quad], T_wc: Transform, calibration: Calibration) -> Image:

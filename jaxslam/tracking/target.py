@@ -15,6 +15,8 @@ from jaxtyping import Float
 from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
+from jaxslam.io.text import numbers_of
+from jaxslam.io.tum import transforms
 from jaxslam.tracking.optics import on_pinhole, rays
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.pose_with_covariance import Places, Positions, Transform
@@ -111,11 +113,8 @@ def _point(index: int, fields: Json, folder: Path) -> KnownPoint:
 
 
 def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
-    try:
-        numbers = np.array(value, float)
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.zeros(0)
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+    numbers = np.array(numbers_of(value))
+    if len(numbers) != count or not np.isfinite(numbers).all():
         raise ValueError(f"{what} must be {count} finite numbers, not {value!r}")
     return numbers
 
@@ -213,8 +212,7 @@ def _sighting(
     J = cv2.projectPoints(positions, turn, shift, K, _IDEAL)[1][:, :6]
     covariance = pixel_sigma**2 * np.linalg.pinv(J.T @ J)
     depths = _in_camera(positions, turn, shift)[:, 2]
-    T_ct = np.eye(4)
-    T_ct[:3, :3], T_ct[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    T_ct = transforms(cv2.Rodrigues(turn)[0], shift)
     # n diag(P) ≥ P for any covariance P of n numbers.
     sigma = np.sqrt(len(depths)) * _depth_sigma(positions, turn, covariance) / depths**2
     # One over the lens's depth, of which a fisheye's is the distance.

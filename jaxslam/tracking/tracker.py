@@ -6,7 +6,6 @@ It is a fold: `step` takes a `TrackerState` and a frame to the next state.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,7 @@ from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import JERK, LEAST_MATCHES, LIVELY, Policy
 from jaxslam.tracking.pose_with_covariance import Pixels, Places, Transform
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.report import History, Tracked
 from jaxslam.tracking.settings import INERTIAL, TrackerSettings
 from jaxslam.tracking.start import places_with_target, trackable
 from jaxslam.tracking.target import Target, TargetObservation, sighted
@@ -59,7 +58,7 @@ def start(
     """The state before the first frame of a camera with this calibration, and maybe a unit whose
     readings tell its motion to a filter that has its model."""
     with jax.enable_x64(True):
-        estimator = Estimator.of(slam, settings, inertial)
+        estimator = Estimator(slam, settings, inertial)
         return TrackerState(estimator, calibration, Map(estimator.empty()))
 
 
@@ -97,7 +96,7 @@ def step(
         tracked = Tracked.of(frame, state.map, repeated=True)
     else:
         with jax.enable_x64(True):
-            state = replace(state, estimator=Estimator.of(slam, settings, inertial))
+            state = replace(state, estimator=Estimator(slam, settings, inertial))
             try:
                 after, tracked = _taken(state, frame, waited, sighting)
             except (FloatingPointError, LinAlgError):
@@ -342,7 +341,7 @@ class Tracker:
         with jax.enable_x64(True):
             return self.state.points()
 
-    def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+    def smoothed(self, history: History) -> tuple[list[Tracked], Points]:
         """Return the frames so far, and all landmarks, as all that was seen later has them: loops
         that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
-from jaxslam.tracking.pose_with_covariance import Positions
+from jaxslam.tracking.pose_with_covariance import Positions, Transforms
 
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
@@ -153,9 +153,7 @@ def _rms(errors: Float[np.ndarray, "k n"]) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
-def _by_orientation(
-    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
-) -> tuple[Rotation, float]:
+def _by_orientation(estimate: Transforms, reference: Transforms) -> tuple[Rotation, float]:
     """Return the mean rotation from estimated to true orientations, and `orientation_rmse`."""
     true, estimated = (Rotation.from_matrix(T[:, :3, :3]) for T in (reference, estimate))
     turn = (true * estimated.inv()).mean()

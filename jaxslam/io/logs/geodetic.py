@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
-from jaxslam.io.text import Table, numbers
+from jaxslam.io.text import Table, rows_of
+from jaxslam.io.tum import transforms
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
@@ -65,16 +66,10 @@ def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
     title = next((number for number, line in lines.items() if _NOVATEL.match(line)), None)
     if title is None:
         return None
-    rows = []
-    for number, line in lines.items():
-        if number <= title or line[0] in "(#%":  # units, and comments
-            continue
-        row = numbers(line.split()[:10], 10)
-        if row is None:
-            expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
-            raise ValueError(f"{path}, line {number}: expected {expected}")
-        rows.append(row)
-    values = np.array(rows)
+    below = ((number, line) for number, line in lines.items() if number > title)
+    told = {number: line.split()[:10] for number, line in below if line[0] not in "(#%"}  # units
+    expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
+    values = rows_of(path, told, 10, expected)
     north, east = (_degrees(values[:, k : k + 3]) for k in (3, 6))
     times = GPS_EPOCH + WEEK * values[:, 1] + values[:, 2]
     found = np.radians(north), np.radians(east), values[:, 9]
@@ -97,10 +92,9 @@ def _log(
     square = FLATTENING * (2 - FLATTENING)
     radius = EQUATOR / np.sqrt(1 - square * np.sin(latitude) ** 2)
     (cn, sn), (ce, se) = ((np.cos(x), np.sin(x)) for x in (latitude, longitude))
-    T = np.tile(np.eye(4), (len(times), 1, 1))
     zero = np.zeros_like(sn)
     axes = (-se, ce, zero), (-sn * ce, -sn * se, cn), (cn * ce, cn * se, sn)
-    T[:, :3, :3] = np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0))
     along = (radius + height) * cn
-    T[:, :3, 3] = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
+    p = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
+    T = transforms(np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0)), p)
     return Log(times, T, P, SAID, (NOTE,), oriented=False, world="ECEF")

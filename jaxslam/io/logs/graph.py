@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.io.logs.log import Log, log
-from jaxslam.io.text import Table, numbers
+from jaxslam.io.text import Table, rows_of
 from jaxslam.io.tum import of_xytheta
 
 _SPATIAL, _PLANAR = "VERTEX_SE3:QUAT", "VERTEX_SE2"
@@ -25,19 +25,12 @@ def read(path: Path, lines: Mapping[int, str]) -> Log | None:
     if kind is None:
         return None
     count = 8 if kind == _SPATIAL else 4
-    rows, places = [], []
-    for number, line in lines.items():
-        first, *told = line.split()
-        if first == kind:
-            row = numbers(told, count)
-            if row is None:
-                expected = f"{kind}, a number, and {count - 1} finite numbers"
-                raise ValueError(f"{path}, line {number}: expected {expected}")
-            rows.append(row)
-            places.append(number)
-    order = np.argsort([row[0] for row in rows], kind="stable")
-    values = np.array(rows)[order]
-    table = Table(path, (), (), values, tuple(np.array(places)[order].tolist()), {})
+    words = {number: line.split() for number, line in lines.items()}
+    told = {number: own for number, (first, *own) in words.items() if first == kind}
+    values = rows_of(path, told, count, f"{kind}, a number, and {count - 1} finite numbers")
+    order = np.argsort(values[:, 0], kind="stable")
+    values = values[order]
+    table = Table(path, (), (), values, tuple(np.array(list(told))[order].tolist()), {})
     if kind == _PLANAR:
         T = of_xytheta(values[:, 1:])
         return Log(values[:, 0], T, np.empty((0, 3, 3)), notes=(NOTE,), stamped=False)

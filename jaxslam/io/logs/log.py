@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.text import Table
-from jaxslam.io.tum import of_xytheta, rows_as_poses
+from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
@@ -69,24 +69,19 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if covariances is None else covariances
-    wrong = np.flatnonzero(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
-    if wrong.size:
-        raise ValueError(f"{table.place(wrong[0])}: expected a covariance of finite numbers")
+    part = np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2))
+    table.check(part, "a covariance of finite numbers")
     times, notes = in_seconds(table, times, unit)
     return Log(times, T, P, said, notes, oriented=oriented)
 
 
-def in_seconds(
-    table: Table, times: Float[np.ndarray, " n"], unit: str = ""
-) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
+def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple[str, ...]]:
     """Times in seconds, of the `unit` that is said, there or by the title of a first column; or of
     the only one in which they are `STEPS` apart.
 
     Raises ValueError, naming the line, for a time that is none.
     """
-    wrong = np.flatnonzero(~np.isfinite(times))
-    if wrong.size:
-        raise ValueError(f"{table.place(wrong[0])}: expected a finite time")
+    table.check(~np.isfinite(times), "a finite time")
     if unit := unit or unit_in("".join(table.titles[:1])):
         return times * UNITS[unit], ()
     try:
@@ -105,23 +100,23 @@ def unit_in(title: str) -> str:
     return found[found.lastindex or 0] if found else ""
 
 
-def unit_of(times: Float[np.ndarray, " n"]) -> str | None:
+def unit_of(times: Times) -> str | None:
     """The only unit of time in which they are `STEPS` apart; None where there is none, or two."""
     fit = units_of(times)
     return fit[0] if len(fit) == 1 else None
 
 
-def units_of(times: Float[np.ndarray, " n"]) -> list[str]:
+def units_of(times: Times) -> list[str]:
     """The units of time in which they are `STEPS` apart."""
     step = _step(times)
     return [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
 
 
-def _step(times: Float[np.ndarray, " n"]) -> float:
+def _step(times: Times) -> float:
     return float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
 
 
-def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
+def check_seconds(what: str, times: Times) -> None:
     """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
     last, step = float(np.abs(times).max()), _step(times)
     # Seconds between two poses, more than a moving thing has.
@@ -138,7 +133,7 @@ def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
 
 
 def symmetric(
-    values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]], t: int = 6
+    values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]] | np.ndarray, t: int = 6
 ) -> Float[np.ndarray, "n t t"]:
     """Symmetric matrices with the columns of `values` at these places, and zeros elsewhere."""
     P = np.zeros((len(values), t, t))

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from jaxslam._runtime.files import LARGEST
 from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric
 from jaxslam.io.text import Table, read_table
-from jaxslam.io.tum import not_rigid, of_xytheta
+from jaxslam.io.tum import not_rigid, of_xytheta, transforms
 
 Reader = Callable[[Table], Log | None]
 EXPECTED = "eight finite numbers t tx ty tz qx qy qz qw (TUM)"
@@ -31,9 +31,7 @@ def _tum(table: Table) -> Log:
 
 def _planar(table: Table) -> Log:
     rows = table.numbers("four finite numbers t x y θ (s, m, rad)")
-    far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
-    if far.size:
-        raise ValueError(f"{table.place(far[0])}: expected numbers up to {LARGEST:.0e}")
+    table.check(np.abs(rows).max(axis=1) > LARGEST, f"numbers up to {LARGEST:.0e}")
     times, notes = in_seconds(table, rows[:, 0])
     return Log(times, of_xytheta(rows[:, 1:]), np.empty((0, 3, 3)), notes=notes)
 
@@ -44,8 +42,7 @@ _KITTI = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)"
 def _kitti(table: Table) -> Log:
     """Times are those of `times.txt` beside it, else the number of the line, from 0."""
     rows = table.numbers(_KITTI)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows.reshape(-1, 3, 4)
+    T = transforms(*np.split(rows.reshape(-1, 3, 4), [3], axis=2))
     wrong = np.flatnonzero(not_rigid(T, 1e-3) | ~(np.abs(rows).max(axis=1) <= LARGEST))
     if wrong.size:
         place = table.place(wrong[0])
@@ -121,9 +118,7 @@ def _finite_or_none(table: Table, expected: str) -> Float[np.ndarray, "n k"]:
     """The rows, finite or without a pose: all NaN but for the time. Raises ValueError."""
     rows = table.rows
     none = without_values(rows)
-    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | ~(none | np.isfinite(rows).all(axis=1)))
-    if wrong.size:
-        raise ValueError(f"{table.place(wrong[0])}: expected {expected}")
+    table.check(~np.isfinite(rows[:, 0]) | ~(none | np.isfinite(rows).all(axis=1)), expected)
     return rows
 
 

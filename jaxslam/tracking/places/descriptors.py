@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.landmarks import Landmarks
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.pose_with_covariance import Places
 
@@ -38,7 +38,7 @@ def describe(
     return descriptors, there
 
 
-def with_looks(landmarks: Mapping[int, Landmark], image: Picture) -> Mapping[int, Landmark]:
+def with_looks(landmarks: Landmarks, image: Picture) -> Landmarks:
     """The landmarks with what they look like in the latest picture, those that it shows."""
     shown = {slot: one for slot, one in landmarks.items() if not one.unseen}
     pixels = np.array([one.seen_at for one in shown.values()]).reshape(-1, 2)
@@ -58,7 +58,7 @@ def described_corners(image: Picture) -> Corners:
     return corners[there], descriptors[there]
 
 
-def candidates(landmarks: Mapping[int, Landmark], corners: Corners) -> ByNumber:
+def candidates(landmarks: Landmarks, corners: Corners) -> ByNumber:
     """Return the corners of a picture that look like landmarks, by the keys of these."""
     owner = np.repeat(list(landmarks), [len(one.looks) for one in landmarks.values()])
     pixels, descriptors = corners

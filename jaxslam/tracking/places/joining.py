@@ -29,7 +29,7 @@ from jaxslam.tracking.pose_with_covariance import (
     carried,
     positive,
 )
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.report import History, Tracked
 from jaxslam.tracking.unit import Join
 
 LOOKED_EVERY = 15
@@ -85,9 +85,7 @@ def join_of(before: Map, state: TrackerState, last: Transform) -> Join | None:
     return Join(before.number, now.number, state.steps, moved, ratio, sigma)
 
 
-def joined(
-    joins: Sequence[Join], history: Sequence[Tracked], points: Points
-) -> tuple[list[Tracked], Points]:
+def joined(joins: Sequence[Join], history: History, points: Points) -> tuple[list[Tracked], Points]:
     """The frames and landmarks, each in the world of the map that its own was joined to."""
     frames = list(history)
     for join in joins:

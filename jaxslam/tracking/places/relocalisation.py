@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.io.tum import transforms
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.observations import Observations, Slots
@@ -70,9 +71,7 @@ def pose_of(
         return None
     which = inside[:, 0].astype(int)
     turn, shift = cv2.solvePnPRefineLM(points[which], pixels[which], K, nothing, turn, shift)
-    T_cw = np.eye(4)
-    T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], unit * shift[:, 0]
-    return np.linalg.inv(T_cw), near[which]
+    return np.linalg.inv(transforms(cv2.Rodrigues(turn)[0], unit * shift)), near[which]
 
 
 def known_again(

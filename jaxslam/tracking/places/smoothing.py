@@ -7,20 +7,19 @@ later says of the second: as much of that as of the way is behind it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from jaxslam.io.logs.log import interpolated
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, TrackerState
 from jaxslam.tracking.places.submaps import Graph, Solved
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, carried
-from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.report import History, Tracked
 
 
-def smoothed(state: TrackerState, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+def smoothed(state: TrackerState, history: History) -> tuple[list[Tracked], Points]:
     """Return the frames and landmarks as they are known now; those of maps with one submap, of maps
     that no camera can come back to, and of one whose poses would not be finite stay as they are."""
     before = state.points()
@@ -76,11 +75,7 @@ class _Part:
 
 
 def _part_of(T: Transform, share: float) -> Transform:
-    part = np.eye(4)
-    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
-    part[:3, 3] = share * T[:3, 3]
-    return part
+    return interpolated(np.arange(2.0), np.array([np.eye(4), T]), np.array([share]))[0]
 
 
 def _parts(one: Map, graph: Graph, solved: Solved) -> list[_Part]:
@@ -107,7 +102,7 @@ def _parts(one: Map, graph: Graph, solved: Solved) -> list[_Part]:
     ]
 
 
-def _cameras(parts: list[_Part], history: Sequence[Tracked]) -> dict[int, PoseWithCovariance]:
+def _cameras(parts: list[_Part], history: History) -> dict[int, PoseWithCovariance]:
     """The cameras of these submaps as they are known now, by the frames' places in the history."""
     known = {}
     where = np.array([frame.submap for frame in history])
