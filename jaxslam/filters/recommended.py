@@ -44,7 +44,7 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     depths, the filter in metres is over-confident. Nothing has to be carried along the base frame.
 
     For a camera with odometry it is the paper's filter, with the same common error of depths, and
-    an update of three steps of Gauss–Newton that ends at the mean of the posterior. Parallax is a
+    an update of six steps of Gauss–Newton that ends at the mean of the posterior. Parallax is a
     product of the displacement and 1/z: one linearisation is too sure of a new landmark's, and the
     maximum of the posterior is at too long a displacement.
 
@@ -70,7 +70,7 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     elif motion.estimates_velocity:
         learns, chosen["scale"], chosen["mixture"] = False, ScaleGauge(), Mixture(9)
     else:
-        chosen["correction"] = Kalman(steps=3, mean=True)
+        chosen["correction"] = Kalman(steps=6, mean=True)
     if learns and depth.common is None:
         depth = replace(depth, common=0.5, walk=walk)
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})

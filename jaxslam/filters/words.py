@@ -55,8 +55,8 @@ FILTERS: dict[str, Callable[..., Slam]] = {
 """
 
 
-def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
-    return replace(slam, depth=replace(slam.depth, common=percent / 100))
+def _learning(slam: Slam, **fields: float) -> Slam:
+    return replace(slam, depth=replace(slam.depth, **fields))
 
 
 def _updated(slam: Slam, word: str, **fields: Any) -> Slam:
@@ -76,8 +76,8 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
 
 
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
-    "scene": _with_scene_depth,
-    "walk": lambda slam, percent=3: replace(slam, depth=replace(slam.depth, walk=percent / 100)),
+    "scene": lambda slam, percent=100: _learning(slam, common=percent / 100),
+    "walk": lambda slam, percent=3: _learning(slam, walk=percent / 100),
     "fej": lambda slam: replace(slam, correction=FirstEstimates()),
     "fej2": lambda slam: replace(slam, correction=ProjectedFirstEstimates()),
     "decoupled": lambda slam: replace(slam, correction=DecoupledInvariant()),

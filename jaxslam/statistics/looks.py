@@ -157,7 +157,7 @@ class Look:
         relative = self._relative_error()
         if relative is None:
             return None
-        t = _quantile(self.sums.count - 1, self.level)
+        t = float(scipy.special.stdtrit(self.sums.count - 1, 1 - self.level / 2))  # Student's
         delta = t * relative
         low, high = self.sums.mean * max(1 - delta, 0.0), math.inf
         if delta < 1 and self.right[0]:
@@ -237,12 +237,6 @@ def _root(factor: float, *, upwards: bool) -> float | None:
     if root == 1 != factor:
         return math.nextafter(1.0, 2.0 if upwards else 0.0)
     return root
-
-
-@lru_cache(maxsize=1024)
-def _quantile(dof: int, level: float) -> float:
-    """The two-sided quantile of Student's t."""
-    return float(scipy.special.stdtrit(dof, 1 - level / 2))
 
 
 @lru_cache(maxsize=1024)

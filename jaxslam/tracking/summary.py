@@ -20,7 +20,6 @@ from jaxslam.tracking.focal import CLEAR, better_lens
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.observations import only
 from jaxslam.tracking.report import History
-from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import as_summary
 from jaxslam.tracking.tracker import Tracker
 from jaxslam.tracking.trajectory import (
@@ -107,7 +106,10 @@ def summarised(
             trajectories = *trajectory_of(history), *(source.reference or ([], []))
             summary["ate_metres"] = absolute_trajectory_error(*trajectories, scaled=False)
     elif tracker.restarts:
-        summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
+        # Each unit is known as well as what all depths of a scene have in common: at the worst as
+        # one of them, σ/ρ of its inverse depth.
+        prior = tracker.settings.depth
+        summary["log_scale_sigma_between_maps"] = math.sqrt(2) * float(prior.sigma / prior.mean)
     return summary | trajectory_errors(source, history)
 
 
@@ -216,15 +218,6 @@ def reference_in_map(source: Source, history: History) -> np.ndarray | None:
         return None
     same = (times >= trajectory.times[0]) & (times <= trajectory.times[-1])
     return there.inverse().moved(T_wc[same])
-
-
-def _scale_between_maps(settings: TrackerSettings) -> float:
-    """σ of the logarithm of the ratio of two maps' units, as far as the prior on depth tells.
-
-    A unit is known as well as what all depths of a scene have in common: at the worst as one of
-    them, σ/ρ of its inverse depth, in each of the two maps.
-    """
-    return math.sqrt(2) * float(settings.depth.sigma / settings.depth.mean)
 
 
 def _units(history: History) -> list[Summary]:

@@ -201,7 +201,7 @@ def test_recommended_is_a_record(geometry, told):
     assert operator.eq(*drifting)
 
 
-ODOMETRY = "robocentric+scene50+walk3+iterated3+mean"
+ODOMETRY = "robocentric+scene50+walk3+iterated6+mean"
 
 
 @pytest.mark.parametrize(

@@ -190,10 +190,9 @@ def to_mean(
     t = jnp.sum(hessian * local_covariance(state, local, slots)[:, None], axis=(2, 3))
     own = observed(local, slots, gain).reshape(m, k, m, p)[jnp.arange(m), :, jnp.arange(m)]
     slope = jnp.sum(hessian * jnp.swapaxes(own, 1, 2)[:, :, None], axis=(1, 3))
-    P = state.covariance
-    delta = -(gain @ t.ravel()) / 2 - observed(local, slots, P).T @ slope.ravel()
-    variance = jnp.diagonal(P)
-    squared = jnp.where(variance > 0, delta**2 / jnp.where(variance > 0, variance, 1.0), 0.0)
+    delta = -(gain @ t.ravel()) / 2 - observed(local, slots, state.covariance).T @ slope.ravel()
+    variance = jnp.diagonal(state.covariance)
+    squared = delta**2 / jnp.where(variance > 0, variance, 1.0)  # zero where nothing is unknown
     return delta / jnp.sqrt(1 + jnp.max(squared))
 
 
