@@ -281,9 +281,10 @@ def evaluate_runs(
             fixed = found
         before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
         if after < before / CLEARLY:
+            error = float(f"{1e3 * sigma:.1g}")
             clock = Mistake(
                 "the clocks of estimate and truth differ",
-                f"the stamps of the estimate are {1e3 * offset:.1f} ± {1e3 * sigma:.1g} ms late, "
+                f"the stamps of the estimate are {1e3 * offset:.1f} ± {error:g} ms late, "
                 f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
                 f"instead of {before:.4g}",
                 after,

@@ -61,7 +61,7 @@ def test_the_file_and_the_table_for_latex(tmp_path, capsys):
     assert told["effective_samples"] > 1
     text = (tmp_path / "evaluation.tex").read_text()
     assert text.splitlines()[0].startswith("% no verdict: the clocks")
-    assert r"axis & RMSE & $\sigma$ claimed & $\sigma$ should be $\times$" in text
+    assert r"axis & RMSE, m or rad & $\sigma$ claimed & $\sigma$ should be $\times$" in text
     assert text.count(r"\\") == 8
 
 

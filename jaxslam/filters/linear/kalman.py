@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.filters.linear.blocks import Model, Noise, minus, observed, plus, residuals
-from jaxslam.filters.linear.covariance import curvature, local_covariance
+from jaxslam.filters.linear.covariance import curvature
 from jaxslam.filters.linear.state import State
 from jaxslam.linalg import cholesky, symmetric_part
 from jaxslam.models.observations import Features, Innovation, Slots, judged
@@ -176,24 +176,23 @@ def to_mean(
     gain: Float[Array, "n mp"],
     context: PyTree,
 ) -> Float[Array, " n"]:
-    """δ from the maximum of a posterior to its mean, `−½ (K t + 2 P Σ_a ∂²h_a K_a)`, where
-    `t_a = tr(∂²h_a P)`, P is the covariance after the update and `K = P Hᵀ R⁻¹` its gain (Lindley,
+    """δ from the maximum of a posterior to its mean, `−P Σ_a ∂²h_a K_a`: −P times the gradient of
+    ½ log det P⁻¹, with the covariance P after the update and its gain `K = P Hᵀ R⁻¹` (Lindley,
     *Approximate Bayesian Methods*, 1980; Tierney, Kadane, JASA 1986).
 
     What multiplies an unknown number, such as the displacement that makes a new landmark's
-    parallax, is on the average less than where it is likeliest. The second derivatives of h are
-    kept. No number moves by more than its σ, beyond which they say nothing.
+    parallax, is on the average less than where it is likeliest. Of the second order this is what
+    the maximum leaves out; `−½ K tr(∂²h P)`, which moves what is measured, made no estimate better.
+    Where δ is longer than 1 σ, derivatives say little: it is shortened to less.
     """
     hessian, local = curvature(model, state, slots, context)
     m, p, k = hessian.shape[:3]
     hessian = jnp.where(used[:, None, None, None], hessian, 0.0)
-    t = jnp.sum(hessian * local_covariance(state, local, slots)[:, None], axis=(2, 3))
     own = observed(local, slots, gain).reshape(m, k, m, p)[jnp.arange(m), :, jnp.arange(m)]
-    slope = jnp.sum(hessian * jnp.swapaxes(own, 1, 2)[:, :, None], axis=(1, 3))
-    delta = -(gain @ t.ravel()) / 2 - observed(local, slots, state.covariance).T @ slope.ravel()
-    variance = jnp.diagonal(state.covariance)
-    squared = delta**2 / jnp.where(variance > 0, variance, 1.0)  # zero where nothing is unknown
-    return delta / jnp.sqrt(1 + jnp.max(squared))
+    slope = jnp.sum(hessian * jnp.swapaxes(own, 1, 2)[:, :, None], axis=(1, 3)).ravel()
+    moved = observed(local, slots, state.covariance).T @ slope
+    squared = slope @ observed(local, slots, moved[:, None])[:, 0]
+    return -moved / jnp.sqrt(1 + squared)
 
 
 def noise_matrix(noise: Noise, used: Bool[Array, " m"]) -> Float[Array, "mp mp"]:
