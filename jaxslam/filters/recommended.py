@@ -56,23 +56,25 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     """
     planar = motion.geometry is PLANAR
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
-    learns, walk = True, 0.03
+    learned: dict[str, float | None] = {}
     chosen: dict[str, Piece] = {}
     if not sensor.hidden:
-        learns, chosen["landmark"] = False, Cartesian()
+        chosen["landmark"] = Cartesian()
     elif motion.has_velocity:
+        learned = {"common": 0.5, "walk": 0.03}
         chosen["scale"], chosen["correction"] = ScaleGauge(), ObservabilityConstrained()
         chosen["mixture"] = Mixture(17 if planar else 9)
         if not _velocity_is_known(motion):
-            walk = None
+            learned["walk"] = None
             chosen["mixture"] = Mixture(5 if planar else 3)
             chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
     elif motion.estimates_velocity:
-        learns, chosen["scale"], chosen["mixture"] = False, ScaleGauge(), Mixture(9)
+        chosen["scale"], chosen["mixture"] = ScaleGauge(), Mixture(9)
     else:
+        learned = {"common": 0.5, "walk": 0.03}
         chosen["correction"] = Kalman(steps=6, mean=True)
-    if learns and depth.common is None:
-        depth = replace(depth, common=0.5, walk=walk)
+    if depth.common is None:
+        depth = replace(depth, **learned)
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})
 
 

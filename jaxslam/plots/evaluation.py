@@ -170,16 +170,11 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
 
 
 def _line(
-    evaluation: Evaluation,
-    ax: Axes,
-    values: np.ndarray,
-    label: str | None,
-    lw: float = 1.8,
-    **style: Any,
+    evaluation: Evaluation, ax: Axes, values: np.ndarray, label: str | None, **style: Any
 ) -> None:
     """Draw values over time, a dot where there is one step, and the label at their end."""
     marker = "o" if evaluation.steps == 1 else None
-    ax.plot(evaluation.times, values, lw=lw, marker=marker, **style)
+    ax.plot(evaluation.times, values, marker=marker, lw=style.pop("lw", 1.8), **style)
     if label is not None:
         label_end(ax, End(label, evaluation.times, values, style["color"]))
 

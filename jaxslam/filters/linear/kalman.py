@@ -80,27 +80,26 @@ class AbstractCorrection(eqx.Module):
         return state
 
 
+def checked_steps(steps: int) -> int:
+    """The steps. Raises ValueError for less than one of Gauss–Newton."""
+    if steps < 1:
+        raise ValueError(f"an update takes at least 1 step of Gauss–Newton, not {steps}")
+    return steps
+
+
 class Kalman(AbstractCorrection):
     """The extended Kalman filter's (P16, P17); of several steps, the iterated one's (Bell, Cathey:
     The Iterated Kalman Filter Update as a Gauss–Newton Method, IEEE TAC 1993)."""
 
-    steps: int = eqx.field(static=True, default=1)
+    steps: int = eqx.field(static=True, default=1, converter=checked_steps)
     """Steps of Gauss–Newton to the maximum of the posterior, all on the prior of the frame."""
     mean: bool = eqx.field(static=True, default=False)
-    """Whether the estimate then moves from the maximum to the mean (`to_mean`)."""
-
-    def __check_init__(self) -> None:
-        check_steps(self.steps)
+    """Whether every step ends at the mean in place of the maximum (`to_mean`), so that the next one
+    is linearised there."""
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         data = features, noise, context, considered, self.mean
         return gauss_newton(model, state, self.steps, lambda before, after: after, *data)
-
-
-def check_steps(steps: int) -> None:
-    """Raise ValueError for less than one step of Gauss–Newton."""
-    if steps < 1:
-        raise ValueError(f"an update takes at least 1 step of Gauss–Newton, not {steps}")
 
 
 def gauss_newton(

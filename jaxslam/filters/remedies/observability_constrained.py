@@ -15,7 +15,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxslam.filters.linear.kalman import AbstractCorrection, check_steps, gauss_newton
+from jaxslam.filters.linear.kalman import AbstractCorrection, checked_steps, gauss_newton
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import SlamModel
 from jaxslam.filters.remedies.gauge import scale_is_free, unobservable_directions
@@ -29,12 +29,9 @@ class ObservabilityConstrained(AbstractCorrection):
     name: ClassVar[str] = "oc"
     knows_gauge: ClassVar[bool] = True
 
-    steps: int = eqx.field(static=True, default=1)
+    steps: int = eqx.field(static=True, default=1, converter=checked_steps)
     """Steps of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first,
     as it does for a large acceleration, the first would be wrong, and carried on."""
-
-    def __check_init__(self) -> None:
-        check_steps(self.steps)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         data = features, noise, context, considered
