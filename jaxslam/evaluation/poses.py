@@ -47,7 +47,7 @@ from jaxslam.evaluation.inputs import (
 from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import at_one_scale, of_aligned
-from jaxslam.io.text import numbers_of
+from jaxslam.io.text import vector_of
 from jaxslam.statistics.bands import Mask, PerAxis
 
 BEYOND = (
@@ -295,12 +295,12 @@ def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
     """The σ of a truth's position (m) and of its orientation (degrees). Raises ValueError."""
     if sigma is None:
         return None
-    told = numbers_of(sigma)
-    if len(told) != 2 or not all(0 <= x <= LARGEST for x in told):
+    told = vector_of(sigma, 2)
+    if told is None or not ((told >= 0) & (told <= LARGEST)).all():
         raise ValueError(
             f"truth_sigma must be two numbers, metres and degrees, not negative, not {sigma}"
         )
-    return told[0], told[1]
+    return float(told[0]), float(told[1])
 
 
 def with_truth(

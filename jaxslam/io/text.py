@@ -209,3 +209,12 @@ def _number(cell: str) -> float | None:
 
 def _is_comment(line: str) -> bool:
     return line.lstrip().startswith(("#", "%"))
+
+
+def vector_of(told: object, count: int) -> Float[np.ndarray, " count"] | None:
+    """The numbers of one list of so many; None of anything else."""
+    try:
+        found = np.asarray(told, float)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return found if found.shape == (count,) else None

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
-from jaxslam.io.text import numbers_of
+from jaxslam.io.text import vector_of
 from jaxslam.io.tum import transforms
 from jaxslam.tracking.optics import on_pinhole, rays
 from jaxslam.tracking.patches import Picture
@@ -113,8 +113,8 @@ def _point(index: int, fields: Json, folder: Path) -> KnownPoint:
 
 
 def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
-    numbers = np.array(numbers_of(value))
-    if len(numbers) != count or not np.isfinite(numbers).all():
+    numbers = vector_of(value, count)
+    if numbers is None or not np.isfinite(numbers).all():
         raise ValueError(f"{what} must be {count} finite numbers, not {value!r}")
     return numbers
 

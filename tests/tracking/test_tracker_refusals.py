@@ -110,6 +110,8 @@ READ = [
     (with_last(5), r"t\.json.* point 3 must be an object, not 5"),
     (with_last(point(name="d", position=[0, 1])), r"t\.json.* position of point d must be 3 fin"),
     (with_last(point(position="x")), r"t\.json.* position of point 3 must be .* not .x."),
+    (with_last(point(position="0 1 2")), "position of point 3 must be 3 finite numbers"),
+    (with_last(point(position=[[0], [1], [2]])), "position of point 3 must be 3 finite numbers"),
     (with_last(point(pixel=None)), r"t\.json.* point 3 needs either a `pixel` .* or a `patch`"),
     (with_last(point(patch="no.png")), r"no\.png: cannot be read as an image"),
     (target({"points": LINE}), r"t\.json.* its points are on one line"),
