@@ -84,7 +84,8 @@ class Sequences(Benchmark):
     def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
         for mark, part in PARTS.items():
             yield "sequences.md", mark, part(results)
-        yield "results.md", MARK, words(results)
+        if tested(results):
+            yield "results.md", MARK, words(results)
 
 
 def measure(source, settings: TrackerSettings) -> dict[str, Any]:

@@ -234,10 +234,18 @@ def cost_as_one(state):
     return 100**2 * (cost(state) + weights @ np.sum((motion - weights @ motion) ** 2, axis=1))
 
 
+def cost_across(state, k):
+    """Of the k-th member across its displacement, in pixels²."""
+    motion = np.asarray(state.members.core.motion)[k, :2]
+    across = np.array([motion[1], -motion[0]]) / np.linalg.norm(motion)
+    return 100**2 * across @ np.asarray(state.members.covariance)[k, 3:5, 3:5] @ across
+
+
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_sum_ends_where_one_gaussian_costs_little_and_begins_again_where_much(monkeypatch, share):
     """Pairs are merged, three in a frame, as soon as the cost of the whole is below `ENOUGH`; one
-    that has ended is not split as soon as it costs what it ended at."""
+    that has ended is split for what it costs across the displacement alone: its scale, which nothing
+    observes, becomes as uncertain as that."""
     state = some_sum()
     monkeypatch.setattr(split_merge, "ENOUGH", float(share * cost_as_one(state)))
     after = split(3)(state)
@@ -245,7 +253,7 @@ def test_a_sum_ends_where_one_gaussian_costs_little_and_begins_again_where_much(
     assert_same_moments(after, state)
     one = SumState(state.members, jnp.where(jnp.arange(9) == 4, 0.0, -jnp.inf))
     monkeypatch.setattr(split_merge, "ENOUGH", 0.0)
-    monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_as_one(one)))
+    monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_across(one, 4)))
     after = split(3)(one)
     assert (after.alive.sum() > 1) == (share < 1)
     assert_same_moments(after, one)
@@ -256,7 +264,7 @@ def test_late_splits_are_across_the_displacement(monkeypatch, share):
     """What is along it stays as uncertain in every member as it was."""
     state = some_sum()
     monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_as_one(state)))
-    parts, _ = quick_jit(lambda state: _as_late(_parts(lambda core: pixels, state)))(state)
+    parts, _ = quick_jit(lambda state: _as_late(_parts(lambda core: pixels, state), jnp.array(False)))(state)
     along = parts.values / np.linalg.norm(parts.values, axis=1)[:, None]
     reached = np.einsum("ki,kic->kc", along, parts.by_core)
     left = np.einsum("ki,kij,kj->k", along, parts.covariances, along)

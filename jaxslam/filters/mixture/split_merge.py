@@ -13,7 +13,8 @@ member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of th
 Splits and mergers keep the sum's mean and covariance. Members that differ along t differ in scale,
 of which the amplitude of innovations says something, wrongly where the prior on depth is wrong: so
 once the cost is small they are split across t alone (`ACROSS`). As soon as one linearisation
-serves, the sum ends in one Gaussian (`ENOUGH`), and is one until it costs more than `ACROSS` again.
+serves, the sum ends in one Gaussian (`ENOUGH`), and is one until that costs more than `ACROSS`
+across t: along it the cost grows with the error of the scale, which nothing observes.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ FEW = 7
 the same time."""
 ACROSS, ENOUGH = 1e-2, 1e-4
 """Costs of a sum as one Gaussian, σ² of a pixel for all landmarks together. Below the first, splits
-are across the displacement alone, and no member that is the only one is split; below the second
-the sum ends: pairs are merged whatever it costs, and no member is split."""
+are across the displacement alone; below the second the sum ends: pairs are merged whatever it
+costs, and no member is split. The only member is, where it costs the first across."""
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
@@ -134,8 +135,8 @@ def _parts(pixels_at: Callable[[Core], Pixels], state: SumState) -> _Parts:
 def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     """So many times, each of other members: the one of the greatest cost split, and two of the
     others merged, if that is a gain; else two merged, if that costs nothing."""
-    parts, cost = _as_late(parts)
     alone = jnp.sum(parts.sum.alive) == 1
+    parts, cost = _as_late(parts, alone)
     one_serves = cost < jnp.where(alone, ACROSS, ENOUGH)
     no = jnp.zeros(rounds, bool)
     places, due, divided = cond(
@@ -148,18 +149,21 @@ def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     return at_places(_replaced, parts.sum, (parts.by_core, split), places, due, None)
 
 
-def _as_late(parts: _Parts) -> tuple[_Parts, Float[Array, ""]]:
-    """What a split may reach: near the end only what is across the values, the displacement; and
-    what the sum costs as one Gaussian."""
+def _as_late(parts: _Parts, alone: Bool[Array, ""]) -> tuple[_Parts, Float[Array, ""]]:
+    """What a split may reach: near the end, and of the only member, only what is across the values,
+    the displacement; and what the sum costs as one Gaussian, or the only member across."""
     cost = jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
+    late = alone | (cost < ACROSS)
 
     def across(value, by_core, P):
         squared = value @ value
-        share = jnp.where(cost < ACROSS, 1.0, 0.0) / jnp.where(squared > 0, squared, 1.0)
+        share = jnp.where(late, 1.0, 0.0) / jnp.where(squared > 0, squared, 1.0)
         left = jnp.eye(value.size, dtype=value.dtype) - share * jnp.outer(value, value)
         return value, left @ by_core, left @ P @ left
 
-    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost
+    left = _Parts(parts.sum, *jax.vmap(across)(*parts[1:]))
+    of_members = jnp.where(parts.sum.alive, jnp.trace(left.covariances, axis1=1, axis2=2), 0.0)
+    return left, jnp.where(alone, jnp.sum(of_members), cost)
 
 
 def _planned(
