@@ -264,7 +264,9 @@ def test_late_splits_are_across_the_displacement(monkeypatch, share):
     """What is along it stays as uncertain in every member as it was."""
     state = some_sum()
     monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_as_one(state)))
-    parts, _ = quick_jit(lambda state: _as_late(_parts(lambda core: pixels, state), jnp.array(False)))(state)
+    parts, _ = quick_jit(
+        lambda state: _as_late(_parts(lambda core: pixels, state), jnp.array(False))
+    )(state)
     along = parts.values / np.linalg.norm(parts.values, axis=1)[:, None]
     reached = np.einsum("ki,kic->kc", along, parts.by_core)
     left = np.einsum("ki,kij,kj->k", along, parts.covariances, along)
