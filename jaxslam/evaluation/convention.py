@@ -171,16 +171,12 @@ def from_right(convention: Convention, estimates: Matrices) -> Squares:
 
 def converted(covariances: Squares, poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Convert covariances of poses from one convention to another."""
-    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
-    transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
-    return P
-
-
-def transport(P: Float[np.ndarray, "k t t"], derivative: Callable[[slice], Squares]) -> None:
-    """Replace every P by `J P Jᵀ`, with the J of a part of them at once."""
+    T, result = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
+    P = result.reshape(-1, *result.shape[-2:])
     for part in blocks(len(P)):
-        J = derivative(part)
+        J = change(T[part], old, new)
         P[part] = J @ P[part] @ np.swapaxes(J, -1, -2)
+    return result
 
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:
@@ -288,13 +284,8 @@ class CovarianceText(NamedTuple):
 
     times: Float[np.ndarray, " n"]
     covariances: Float[np.ndarray, "n t t"]
-    said: dict[str, str]
-    """The words of its header that are of a `Convention`."""
-
-    @property
-    def convention(self) -> Convention:
-        """The convention of the header, and the default where it is silent."""
-        return Convention(**self.said)
+    convention: Convention
+    """The convention of the header, and the default where it is silent."""
 
 
 def write_covariances(
@@ -327,7 +318,7 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     word of the header that is not known.
     """
     found = covariances_of_file(path, t)
-    return CovarianceText(found.times, found.covariances, dict(found.said))
+    return CovarianceText(found.times, found.covariances, Convention(**found.said))
 
 
 def covariances_of_file(path: str | Path, t: int = 6) -> Log:

@@ -17,12 +17,15 @@ from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import (
     BLOCK,
     CHOICES,
+    Axes,
     Convention,
     Joints,
     Squares,
+    Tangents,
     Values,
     blocks,
     geometry_of,
+    pose_errors,
 )
 from jaxslam.io.logs.log import check_seconds, symmetric
 from jaxslam.io.text import Table, read_table
@@ -305,7 +308,7 @@ MOST = 20_000
 
 
 class Poses(NamedTuple):
-    """Runs of estimated poses T_wc, their covariances, and the truth."""
+    """Runs of estimated poses T_wc, their covariances, the truth, and how they are compared."""
 
     estimates: Float[np.ndarray, "runs steps d d"]
     covariances: Float[np.ndarray, "runs steps t t"]
@@ -316,6 +319,30 @@ class Poses(NamedTuple):
     """The errors that the covariances are of."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
+    align: str = "none"
+    used: tuple[str, ...] = ()
+    """The names of the axes that are compared; none where they are to be found."""
+    truth_sigma: tuple[float, float] | None = None
+    """The σ of the true poses, m and degrees; None of exact ones."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all axes, in the order of a covariance."""
+        return self.convention.names(geometry_of(self.estimates))
+
+    @property
+    def axes(self) -> Axes:
+        """The places of the axes that are compared, or of all."""
+        return np.array([i for i, x in enumerate(self.names) if x in (self.used or self.names)])
+
+    def errors(self) -> Tangents:
+        """The exact errors of the stated kind, along these axes."""
+        return pose_errors(self.convention, self.estimates, self.truths)[..., self.axes]
+
+    def along_axes(self) -> Squares:
+        """The covariances of these errors."""
+        axes, P = self.axes, self.covariances
+        return P if len(axes) == P.shape[-1] else P[..., axes[:, None], axes]
 
     def some(self) -> Poses:
         """Steps of equal distances, with the first one of every run: `MOST` poses, or all."""
@@ -326,11 +353,18 @@ class Poses(NamedTuple):
         steps = np.union1d(np.arange(0, self.logged.shape[1], every), first)
         return self.at((slice(None), steps))
 
+    def later(self, start: int, logged: Mask) -> Poses:
+        """Those from a step on that are to be compared."""
+        t, there = self.covariances.shape[-1], logged[:, start:]
+        joint = None if self.joint is None else self.joint[:, start * t :, start * t :]
+        poses = self.at((slice(None), slice(start, None)), joint)
+        return poses._replace(covariances=filled(poses.covariances, there, np.eye(t)), logged=there)
+
     def at(self, places: tuple[Any, ...], joint: np.ndarray | None = None) -> Poses:
         """Those at some places, and their joint covariance."""
-        arrays = self.estimates, self.covariances, self.truths, self.logged
-        T, P, truths, logged = (x[places] for x in arrays)
-        return Poses(T, P, truths, logged, self.convention, joint)
+        T, P, truths, logged, *compared = self
+        arrays = (x[places] for x in (T, P, truths, logged))
+        return Poses(*arrays, *compared)._replace(joint=joint)
 
 
 def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:

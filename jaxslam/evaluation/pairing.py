@@ -7,6 +7,7 @@ time; and where it is much rarer than the estimate, the estimate is moved to its
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,9 +27,9 @@ from jaxslam.evaluation.convention import (
     geometry_of,
 )
 from jaxslam.evaluation.inputs import exactly_known, without_unknown
-from jaxslam.evaluation.tracked_frames import EvaluatedPoses, evaluated_poses
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
+from jaxslam.io.logs.frames import read_frames
 from jaxslam.io.logs.log import Log, check_seconds, interpolated
 from jaxslam.io.tum import Times
 
@@ -43,6 +44,16 @@ SPARSE = 3.0
 """The number of poses to every true one from which the estimate is taken at the truth's stamps."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 _SAME = Convention("split", "mixed")
+
+
+class EvaluatedPoses(NamedTuple):
+    """A mask of the poses of a run that have a part in the verdict, and of the others why not."""
+
+    poses: Bool[np.ndarray, " n"]
+    map: int
+    """The map that is evaluated."""
+    others: Mapping[str, Bool[np.ndarray, " n"]]
+    """Masks of the poses of other maps, of lost frames, and from before the unit was fixed."""
 
 
 class RunFiles(NamedTuple):
@@ -428,3 +439,39 @@ def _held(times: Float[np.ndarray, " n"]) -> str:
 
 def _span(times: Float[np.ndarray, " n"]) -> float:
     return float(times[-1] - times[0]) if len(times) else 0.0
+
+
+def evaluated_poses(folder: Path, times: Times, known: Bool[np.ndarray, " n"]) -> EvaluatedPoses:
+    """The poses at these times that the tracker's file in the folder leaves to be evaluated.
+
+    They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
+    that is `known` exactly stays: it is where the map begins, and has a place in any unit. All
+    poses where there is no such file. Raises ValueError where it is of other times, or nothing is
+    left.
+    """
+    path = folder / "frames.csv"
+    frames = read_frames(path)
+    if frames is None:
+        return EvaluatedPoses(np.ones(len(times), bool), 0, {})
+    order = np.argsort(frames[0], kind="stable")
+    place = np.interp(times, frames[0][order], np.arange(len(order)))
+    nearest = order[np.rint(place).astype(int)]
+    at, lost, maps, fixed = (x[nearest] for x in frames)
+    away = np.abs(at - times)
+    if away.max() > MAX_TIME_DIFFERENCE:
+        raise ValueError(
+            f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
+            f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
+        )
+    usable = fixed & ~lost
+    if not usable.any():
+        raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
+    number = int(np.argmax(np.bincount(maps[usable])))
+    own = maps == number
+    opening = own & ~lost & ~fixed & ~known
+    others = {
+        "poses are of other maps, each with its own unit": ~own,
+        "poses are of frames that are lost": own & lost,
+        "poses are from before the unit of their map was fixed": opening,
+    }
+    return EvaluatedPoses(own & ~lost & ~opening, number, others)

@@ -17,7 +17,7 @@ from jaxslam._runtime import plotted
 from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.evaluation.alignment import INDEPENDENT
-from jaxslam.evaluation.convention import Convention, Values
+from jaxslam.evaluation.convention import Convention, Squares
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
     at,
@@ -76,6 +76,8 @@ class Evaluation:
     """The error of every run, step and axis; NaN where nothing was logged."""
     sigmas: PerAxis
     """The σ that the filter claims of every error."""
+    covariances: Float[np.ndarray, "runs steps n n"]
+    """The covariances of the errors; identities where nothing was logged."""
     whitened: PerAxis
     """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
     times: Float[np.ndarray, " steps"]
@@ -92,10 +94,6 @@ class Evaluation:
     """The convention that would make the data consistent, where it was searched for."""
     notes: tuple[str, ...] = ()
     """Remarks on what was left out, and what was assumed."""
-    fitted: float = 0.0
-    """The most degrees of freedom that a fit of the scale of a run took from every NEES."""
-    axis_fitted: tuple[float, ...] = ()
-    """The same of every axis alone; empty where nothing was fitted."""
     scale: Scale | None = None
     """The scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
     truth_sigma: tuple[float, float] | None = None
@@ -116,6 +114,11 @@ class Evaluation:
     def steps(self) -> int:
         """The number of steps of the longest run."""
         return self.nees.shape[1]
+
+    @property
+    def fitted(self) -> float:
+        """The most degrees of freedom that a fit of the scale of a run took from every NEES."""
+        return 0.0 if self.scale is None else self.scale.fitted
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -267,7 +270,7 @@ class Evaluation:
     def _axis_verdicts(self) -> list[Verdict]:
         with np.errstate(over="ignore"):
             normalised = np.split(self.errors / self.sigmas, len(self.names), axis=-1)
-            fitted = self.axis_fitted or (0.0,) * len(self.names)
+            fitted = (0.0,) * len(normalised) if self.scale is None else self.scale.axis_fitted
             return [self._verdict(z, z, 1, f) for z, f in zip(normalised, fitted, strict=True)]
 
     def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
@@ -578,7 +581,7 @@ def evaluate(
     )
 
 
-def of_steps(errors: PerAxis, P: Values, logged: Mask, **words: Any) -> Evaluation:
+def of_steps(errors: PerAxis, P: Squares, logged: Mask, **words: Any) -> Evaluation:
     """The evaluation of errors and their covariances at the steps that were logged."""
     z = whitened(errors, P)
     return Evaluation(
@@ -587,6 +590,7 @@ def of_steps(errors: PerAxis, P: Values, logged: Mask, **words: Any) -> Evaluati
         whitened=filled(z, logged, np.nan),
         errors=filled(errors, logged, np.nan),
         sigmas=filled(sigmas(P), logged, np.nan),
+        covariances=P,
         **words,
     )
 
@@ -624,6 +628,7 @@ def evaluate_nees(
         nees=values,
         errors=none,
         sigmas=none,
+        covariances=np.empty((*values.shape, 0, 0)),
         times=step_times(times, values.shape[1]),
         timed=times is not None,
         names=(),
@@ -638,7 +643,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
 
-def _mean(values: Values, there: Mask) -> Float[np.ndarray, "steps ..."]:
+def _mean(values: np.ndarray, there: Mask) -> Float[np.ndarray, "steps ..."]:
     """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
     total = np.sum(filled(values, there, 0.0), axis=0)
