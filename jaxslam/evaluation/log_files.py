@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +26,8 @@ _CONTENTS = (
     "(or σ instead of covariances), or nees or nis with dof"
 )
 _ALONE = ("nees", "nis")
-
-
-class PoseOptions(TypedDict):
-    """The options for evaluating poses, see `evaluate_poses`."""
-
-    align: str
-    axes_used: str | Sequence[str]
-    truth_sigma: Sequence[float] | None
+Options = Mapping[str, Any]
+"""The options for evaluating poses, see `evaluate_poses`."""
 
 
 def evaluate_log(
@@ -73,7 +67,7 @@ def evaluate_log(
         raise ValueError("give --nis or --innovations FILE, not both")
     (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
     estimate = estimate or topic or None
-    how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
+    how = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if against is not None and truth is not None:
@@ -96,7 +90,7 @@ def evaluate_log(
     return described(found, notes=(*found.notes, f"{told}; {advice(of_innovations, found)}"))
 
 
-def _of_arrays(source: Path, stated: dict[str, str], how: PoseOptions, nis: bool) -> Evaluation:
+def _of_arrays(source: Path, stated: dict[str, str], how: Options, nis: bool) -> Evaluation:
     read = (read_arrays_of(source), (), ()) if source.suffix in ARRAYS else read_csv(source)
     arrays, runs, steps = read
     found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
@@ -114,7 +108,7 @@ def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
 
 
 def _evaluate_arrays(
-    arrays: dict[str, np.ndarray], stated: dict[str, str], how: PoseOptions, nis: bool
+    arrays: dict[str, np.ndarray], stated: dict[str, str], how: Options, nis: bool
 ) -> Evaluation:
     """The verdict on errors, innovations or poses, by the names of the arrays."""
     held = [name for name in (*_ALONE, "errors", "innovations", "estimates") if name in arrays]
@@ -242,7 +236,7 @@ def evaluate_runs(
     source: Path,
     runs: tuple[RunFiles, ...],
     stated: dict[str, str],
-    how: PoseOptions,
+    how: Options,
     time_offset: float | str = 0.0,
     *,
     against: bool = False,
@@ -256,59 +250,59 @@ def evaluate_runs(
     if against:
         read = [with_other(one, convention) for one in read]
     for one in read:
-        if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
+        if one.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
-                f"{one.logs.files.estimate}: its longest map is map {one.evaluated.map}, in a unit "
-                "of its own; use --align sim3"
+                f"{one.logs.files.estimate}: its longest map is map {one.map}, in a unit of its "
+                "own; use --align sim3"
             )
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
-    names = tuple(run.name for run in runs)
-    longest = max(read, key=lambda one: len(one.times))
-    told: tuple[str, ...] = ()
+    names, told = tuple(run.name for run in runs), []
     if not all(one.logs.oriented for one in read) and not how["axes_used"]:
         how = {**how, "axes_used": ("x", "y", "z")}
-        told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
+        told = ["without orientations: positions alone are compared (--axes-used x,y,z)"]
     place = runs[0].estimate if len(runs) == 1 else source
     found = named(place, lambda: _compared(read, convention, how), names)
-    wrong = suspect(found)
-    late = _offset(read) if wrong or time_offset == "auto" else None
-    if wrong and late is not None and late.found:
-        offset, sigma = late
-        try:
-            fixed = _compared([paired(one.logs, offset) for one in read], convention, how)
-        except ValueError:  # an offset at which few poses have a truth is none of clocks
-            fixed = found
-        before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
-        if after < before / CLEARLY:
-            error = float(f"{1e3 * sigma:.1g}")
-            clock = Mistake(
-                "the clocks of estimate and truth differ",
-                f"the stamps of the estimate are {1e3 * offset:.1f} ± {error:g} ms late, "
-                f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
-                f"instead of {before:.4g}",
-                after,
-            )
-            found = described(found, causes=(clock, *fixed.causes))
+    late, automatic = None, time_offset == "auto"
+    if suspect(found) or automatic:
+        late = _offset(read)
+    if suspect(found) and late is not None and late.found:
+        found = described(_in_time(read, convention, how, found, late), time_offset=late)
+    elif automatic:
         found = described(found, time_offset=late)
-    elif time_offset == "auto":
-        found = described(found, time_offset=late)
-    told += (*_remarks(read), *_other_times(read, longest))
-    if not read[0].logs.covariances.said and not stated:
-        told += (f"the file does not state its convention; assumed: {convention}",)
+    told += _remarks(read)
+    if not read[0].logs.estimate.said and not stated:
+        told.append(f"the file does not state its convention; assumed: {convention}")
     return described(found, notes=(*found.notes, *told), run_names=names)
 
 
-def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> Evaluation:
-    truths = [np.where(x.evaluated.poses[:, None, None], x.truths, np.nan) for x in read]
-    return evaluate_poses(
-        _filled_up([one.estimates for one in read]),
-        _filled_up([one.covariances for one in read]),
-        _filled_up(truths),
-        convention,
-        times=max((one.times for one in read), key=len),
-        **how,
+def _in_time(
+    read: list[RunLog], convention: Convention, how: Options, found: Evaluation, late: Offset
+) -> Evaluation:
+    """The evaluation with the offset of the clocks as the cause, where NEES falls without it."""
+    offset, sigma = late
+    try:
+        fixed = _compared([paired(one.logs, offset) for one in read], convention, how)
+    except ValueError:  # an offset at which few poses have a truth is none of clocks
+        return found
+    before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
+    if after >= before / CLEARLY:
+        return found
+    error = float(f"{1e3 * sigma:.1g}")
+    clock = Mistake(
+        "the clocks of estimate and truth differ",
+        f"the stamps of the estimate are {1e3 * offset:.1f} ± {error:g} ms late, "
+        f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
+        f"instead of {before:.4g}",
+        after,
     )
+    return described(found, causes=(clock, *fixed.causes))
+
+
+def _compared(read: list[RunLog], convention: Convention, how: Options) -> Evaluation:
+    arrays = ([getattr(x, name) for x in read] for name in ("estimates", "covariances", "truths"))
+    times = max((one.times for one in read), key=len)
+    return evaluate_poses(*map(_filled_up, arrays), convention, times=times, **how)
 
 
 def _offset(read: list[RunLog]) -> Offset | None:
@@ -332,11 +326,18 @@ def _remarks(read: list[RunLog]) -> Iterator[str]:
     shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
     if shortest < longest:
         yield f"runs have {shortest} to {longest} poses"
+    first = max(read, key=lambda one: len(one.times))
+    later = (one.times - first.times[: len(one.times)] for one in read)
+    if any(np.abs(x - x[0]).max() > MAX_TIME_DIFFERENCE for x in later):
+        yield (
+            "steps are counted from the first pose of each run; their times differ between runs, "
+            f"and are those of {first.logs.files.name}"
+        )
 
 
 def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
     """The convention of all runs. Raises ValueError where their files say different ones."""
-    said = {one.logs.files.of_covariances: one.logs.covariances.said for one in read}
+    said = {one.logs.files.of_covariances: one.logs.estimate.said for one in read}
     (first, of_first), *others = said.items()
     for place, own in others:
         if own != of_first:
@@ -383,15 +384,3 @@ def named(
         )
     except ValueError as error:
         raise ValueError(f"{source}: {renamed(str(error))}") from None
-
-
-def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
-    """A remark where steps, which are counted, are not at the same times after the first pose."""
-    for one in read:
-        later = one.times - longest.times[: len(one.times)]
-        if np.abs(later - later[0]).max() > MAX_TIME_DIFFERENCE:
-            yield (
-                "steps are counted from the first pose of each run; their times differ between "
-                f"runs, and are those of {longest.logs.files.name}"
-            )
-            return
