@@ -111,16 +111,14 @@ def _log_volume(poses: Poses) -> float:
 
 def _tried(found: Evaluation, log_volume: float) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
-    turns = np.array([name.startswith("r") for name in found.names])
-
-    def of(block: np.ndarray) -> np.ndarray:
-        z = whitened(found.errors[..., block], found.covariances[..., block, :][..., block])
-        return filled(squared(z), found.logged, np.nan)
-
+    turns, parts = np.array([name.startswith("r") for name in found.names]), {}
+    for what, block in (("position", ~turns), ("rotation", turns)):
+        if block.any():
+            e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
+            nees = filled(squared(whitened(e, P)), found.logged, np.nan)
+            parts[what] = nees, int(block.sum())
     log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
-    parts = (of(block) if block.any() else None for block in (~turns, turns))
-    volume = log_determinant - log_volume
-    return Tried(found.nees, found.dof, found.fitted, volume, *parts, int(turns.sum()))
+    return Tried(found.nees, found.dof, found.fitted, log_determinant - log_volume, parts)
 
 
 def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:

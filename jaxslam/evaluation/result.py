@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -281,6 +281,8 @@ class Evaluation:
         """The content of `evaluation.json`."""
         from jaxslam._version import __version__
 
+        names, bias, found = [*enumerate(self.names)], self.bias, self.correlation
+        outside, rmse, sigma = self.outside3sigma, self.rmse, self.sigma
         return {
             "schema": 1,
             "version": __version__,
@@ -297,16 +299,32 @@ class Evaluation:
             "verdict": self.verdict,
             "run_names": list(self.run_names),
             "lost_runs": self.lost_runs,
-            **_by_axis(self),
+            "outside3sigma": {name: float(outside[i]) for i, name in names},
+            "rmse": {name: json_numbers(rmse[:, i]) for i, name in names},
+            "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
+            "axis_verdict": {name: self.axis_verdict(i) for i, name in names},
             "coverage": self.coverage,
-            **_beside_nees(self),
-            "convention": None if self.convention is None else asdict(self.convention),
+            "effective_samples": self._of_nees.get("effective"),
+            "time_offset": self.time_offset
+            and dict(zip(("seconds", "sigma"), self.time_offset, strict=True)),
+            "causes": [
+                {"cause": x.what, "evidence": x.told, "nees_without": x.nees} for x in self.mistakes
+            ],
+            "bias": bias
+            and {x: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, x in names},
+            "correlation": found
+            and {
+                "matrix": found.matrix.tolist(),
+                "axes": [self.names[i] for i in found.axes],
+                "p": found.p,
+            },
+            "convention": self.convention and asdict(self.convention),
             "alignment": self.alignment,
-            "truth_sigma": None if self.truth_sigma is None else list(self.truth_sigma),
+            "truth_sigma": self.truth_sigma and list(self.truth_sigma),
             "fitted": self.fitted,
-            "scale": None if self.scale is None else self.scale.asdict(),
-            "suggested": None if self.suggested is None else asdict(self.suggested),
-            "identified": None if self.identified is None else self.identified.asdict(),
+            "scale": self.scale and self.scale.asdict(),
+            "suggested": self.suggested and asdict(self.suggested),
+            "identified": self.identified and self.identified.asdict(),
             "mistakes": [mistake.told for mistake in self.mistakes],
             "notes": self.remarks,
         }
@@ -354,22 +372,21 @@ class Evaluation:
 
 def _told(evaluation: Evaluation) -> str:
     """The verdict in lines, or the mistakes of the log in its place."""
+    if evaluation.mistakes:
+        return "\n".join([evaluation.headline, *(x.told for x in evaluation.mistakes)])
     # Lost runs are named below, by their names here.
     more = sentences(evaluation._of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
-    told = [evaluation.headline, *more]
+    told, lost = [evaluation.headline, *more], evaluation.lost_runs
     if evaluation.scale is not None and not evaluation.scale.disproved:
         told.append(evaluation.scale.sentence)
     told += _beyond_nees(evaluation)
-    doubt = [] if evaluation.identified is None else [evaluation.identified.sentence]
-    if evaluation.lost_runs:
-        more = len(evaluation.lost_runs) - _LISTED
-        which = ", ".join(evaluation.lost_runs[:_LISTED]) + (
-            f" and {more} more" if more > 0 else ""
-        )
-        told.append(f"{'lost' if evaluation.quantity == 'NEES' else 'outlying'}: {which}")
-    if evaluation.mistakes:
-        told, doubt = [evaluation.headline, *(mistake.told for mistake in evaluation.mistakes)], []
-    return "\n".join([*told, *doubt])
+    if lost:
+        others = f" and {len(lost) - _LISTED} more" if len(lost) > _LISTED else ""
+        what = "lost" if evaluation.quantity == "NEES" else "outlying"
+        told.append(f"{what}: {', '.join(lost[:_LISTED])}{others}")
+    if evaluation.identified is not None:
+        told.append(evaluation.identified.sentence)
+    return "\n".join(told)
 
 
 def described(found: Evaluation, **words: Any) -> Evaluation:
@@ -379,28 +396,6 @@ def described(found: Evaluation, **words: Any) -> Evaluation:
         if name in found.__dict__:
             result.__dict__[name] = found.__dict__[name]
     return result
-
-
-def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
-    """What is said beside NEES, as JSON has it."""
-    names, bias, found = evaluation.names, evaluation.bias, evaluation.correlation
-    offset = evaluation.time_offset
-    return {
-        "effective_samples": evaluation._of_nees.get("effective"),
-        "time_offset": None if offset is None else {"seconds": offset[0], "sigma": offset[1]},
-        "causes": [
-            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
-            for x in evaluation.mistakes
-        ],
-        "bias": bias
-        and {n: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, n in enumerate(names)},
-        "correlation": found
-        and {
-            "matrix": found.matrix.tolist(),
-            "axes": [names[i] for i in found.axes],
-            "p": found.p,
-        },
-    }
 
 
 def _as_assumed(found: Verdict, notes: Sequence[str]) -> Verdict:
@@ -436,45 +431,31 @@ def latex(evaluation: Evaluation) -> str:
     return "\n".join([*comments, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _by_axis(evaluation: Evaluation) -> dict[str, Json]:
-    places = {name: i for i, name in enumerate(evaluation.names)}
-    outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
-    return {
-        "outside3sigma": {name: float(outside[i]) for name, i in places.items()},
-        "rmse": {name: json_numbers(rmse[:, i]) for name, i in places.items()},
-        "sigma": {name: json_numbers(sigma[:, i]) for name, i in places.items()},
-        "axis_verdict": {name: evaluation.axis_verdict(i) for name, i in places.items()},
-    }
-
-
 def _covered(evaluation: Evaluation) -> str:
     shares = [f"{share:.1%}" for share in evaluation.coverage.values()]
     what = "errors" if evaluation.quantity == "NEES" else "innovations"
     return f"sets of 50, 90 and 99 % hold {shares[0]}, {shares[1]} and {shares[2]} of the {what}"
 
 
-def _beyond_nees(evaluation: Evaluation) -> list[str]:
+def _beyond_nees(evaluation: Evaluation) -> Iterator[str]:
     """A sentence on a mean error, and one on a correlation, where they are more than chance.
 
     Either is said of a right filter in one study of 200.
     """
-    names, bias, found, told = evaluation.names, evaluation.bias, evaluation.correlation, []
-    level = (1 - VERDICT_CONFIDENCE) / 2
-    if bias is not None and len(names) * np.min(bias.p) < level:
+    names, bias, found = evaluation.names, evaluation.bias, evaluation.correlation
+
+    def beyond_chance(p: float) -> str:
+        if p >= (1 - VERDICT_CONFIDENCE) / 2:
+            return ""
+        return f", more than chance ({f'p = {p:.2g}' if p >= 1e-4 else 'p < 0.0001'})"
+
+    if bias is not None and (chance := beyond_chance(len(names) * np.min(bias.p))):
         axis = int(np.lexsort((-np.abs(bias.mean), bias.p))[0])
-        what = f"the mean error of {names[axis]} is {bias.mean[axis]:.2f} σ"
-        told.append(f"{what}, more than chance ({_p(len(names) * bias.p[axis])})")
-    if found is not None and found.p < level:
+        yield f"the mean error of {names[axis]} is {bias.mean[axis]:.2f} σ{chance}"
+    if found is not None and (chance := beyond_chance(found.p)):
         first, second = (names[i] for i in found.axes)
-        what = (
-            f"whitened errors of {first} and {second} correlate by {found.matrix[found.axes]:.2f}"
-        )
-        told.append(f"{what}, more than chance ({_p(found.p)})")
-    return told
-
-
-def _p(p: float) -> str:
-    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+        by = f"{found.matrix[found.axes]:.2f}"
+        yield f"whitened errors of {first} and {second} correlate by {by}{chance}"
 
 
 def _counted(evaluation: Evaluation) -> str:
@@ -509,26 +490,21 @@ def _run(evaluation: Evaluation, run: int) -> str:
 
 
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """The cells of the table: titles, a row of each axis, and what they are of a right filter."""
     errors = "RMSE, m or rad" if evaluation.convention and not evaluation.scale else "RMSE"
-    return [
-        ("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
-        *(_row(evaluation, i) for i in range(len(evaluation.names))),
-        ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
-    ]
-
-
-def _row(evaluation: Evaluation, axis: int) -> tuple[str, ...]:
-    found = evaluation.axis_verdict(axis)
-    there = evaluation.logged.any(axis=0)
-    rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (evaluation.rmse, evaluation.sigma))
-    factor, low, high = (
-        "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
-        for x in (found["sigma_factor"], *found["interval99"])
-    )
-    if (found["interval99"][1] or 0) > MOST:
-        high = f"> {MOST:g}"
-    outside = f"{evaluation.outside3sigma[axis]:.2%}"
-    return evaluation.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
+    rows = [("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ")]
+    there, outside = evaluation.logged.any(axis=0), evaluation.outside3sigma
+    for axis, name in enumerate(evaluation.names):
+        found = evaluation.axis_verdict(axis)
+        rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (evaluation.rmse, evaluation.sigma))
+        factor, low, high = (
+            "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
+            for x in (found["sigma_factor"], *found["interval99"])
+        )
+        if (found["interval99"][1] or 0) > MOST:
+            high = f"> {MOST:g}"
+        rows.append((name, rmse, sigma, factor, f"[{low}, {high}]", f"{outside[axis]:.2%}"))
+    return [*rows, ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}")]
 
 
 def _in_columns(*rows: tuple[str, ...]) -> list[str]:
