@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import nearest_rotation
-from jaxslam.io.logs.log import interpolated
+from jaxslam.io.logs.log import interpolated, turns
 
 FURTHEST = 0.5
 """The largest offset that is looked for, s."""
@@ -100,13 +100,5 @@ def _sigma(before: np.ndarray, now: np.ndarray, after: np.ndarray, apart: float)
 
 def increments(T: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "k r"]:
     """The rotation vectors from each pose to the next; NaN where one of both is."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    n = T.shape[-1] - 1
-    turn = np.swapaxes(T[:-1, :n, :n], 1, 2) @ T[1:, :n, :n]
-    if n == 2:
-        return np.arctan2(turn[:, 1, 0], turn[:, 0, 0])[:, None]
-    there = ~np.isnan(turn).any(axis=(1, 2))
-    result = np.full((len(turn), 3), np.nan)
-    result[there] = Rotation.from_matrix(turn[there]).as_rotvec()
-    return result
+    vectors = turns(T[:-1], T[1:])
+    return vectors if T.shape[-1] == 4 else vectors[:, 2:]
