@@ -27,6 +27,7 @@ from jaxslam.evaluation.convention import (
 )
 from jaxslam.evaluation.inputs import MOST, Poses, exactly_known
 
+Positions = Float[np.ndarray, "k n"]
 ALIGNMENTS = ("none", "first", "yaw", "se3", "sim3")
 MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
@@ -99,20 +100,14 @@ def nearest_rotation(M: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return left * signs @ right
 
 
-def angles(
-    R: Float[np.ndarray, "*k n n"], others: Float[np.ndarray, "*other n n"]
-) -> Float[np.ndarray, "*k"]:
+def angles(R: Matrices, others: np.ndarray) -> np.ndarray:
     """The angles between rotations."""
     chord = np.linalg.norm(R - others, axis=(-2, -1)) / np.sqrt(2)
     return np.asarray(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
 
 
 def similarity(
-    estimate: Float[np.ndarray, "k n"],
-    reference: Float[np.ndarray, "k n"],
-    *,
-    scaled: bool,
-    yaw: bool = False,
+    estimate: Positions, reference: Positions, *, scaled: bool, yaw: bool = False
 ) -> Similarity:
     """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two; or
     by a rotation about the vertical alone, `yaw`.
@@ -134,44 +129,36 @@ def similarity(
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
-def turned_about(
-    fit: Similarity, line: Float[np.ndarray, " 3"], estimates: Matrices, reference: Matrices
-) -> Similarity:
+def turned_about(fit: Similarity, line: Float[np.ndarray, " 3"], run: Poses) -> Similarity:
     """A fit whose rotation about a line is that of all orientations, not of the positions.
 
     Exp(φ line) makes `Σ tr R_refᵀ R_fit Exp(φ line) R_est` the greatest. To first order
     `Σ lineᵀ δθ = 0`, of rotations along the axes of the estimate's world.
     """
-    M = np.einsum("kij,klj->il", estimates[:, :3, :3], reference[:, :3, :3]) @ fit.rotation
+    T, true = run.estimates, run.truths
+    M = np.einsum("kij,klj->il", T[:, :3, :3], true[:, :3, :3]) @ fit.rotation
     K = -lever(line)
     angle = np.arctan2(np.trace(K @ M), np.trace(M) - line @ M @ line)
     turn = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
     rotation = fit.rotation @ turn
-    centre, target = estimates[:, :3, 3].mean(0), reference[:, :3, 3].mean(0)
+    centre, target = T[:, :3, 3].mean(0), true[:, :3, 3].mean(0)
     return Similarity(rotation, target - fit.scale * rotation @ centre, fit.scale)
 
 
-def projected(
-    T_wc: Float[np.ndarray, "k d d"],
-    covariances: Float[np.ndarray, "k t t"] | Float[np.ndarray, "kt kt"],
-    align: str,
-    line: Float[np.ndarray, " 3"] | None = None,
-) -> Float[np.ndarray, "k t t"]:
-    """The covariances of aligned poses in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
+def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Squares:
+    """The covariances of an aligned run in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
 
-    About a `line` it is that of `turned_about`. `covariances` are those of every pose, whose errors
-    are then taken as independent of each other's, or the joint one of all; of errors that are split
-    along the axes of the world. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
+    About a `line` it is that of `turned_about`. Errors, which are split along the axes of the
+    world, are taken as independent of each other's where there is no joint covariance. With
+    W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
     `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
-    count, P, U = len(T_wc), covariances, gauge_directions(T_wc, align)
+    P, U = run.covariances, gauge_directions(run.estimates, run.align)
     V = _fitted(U, line)
-    if P.ndim == 2:
-        P = np.swapaxes(P.reshape(count, len(P) // count, count, -1), 1, 2)
-        VP = np.einsum("kta,kjtu->jau", V, P)
-        P = P[range(count), range(count)]
-    else:
-        VP = np.swapaxes(V, 1, 2) @ P
+    VP = np.swapaxes(V, 1, 2) @ P
+    if run.joint is not None:
+        blocks = run.joint.reshape(*P.shape[:2], *P.shape[:2])
+        VP = np.einsum("kta,ktju->jau", V, blocks)
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
     lost = UW @ VP
     return P - lost - np.swapaxes(lost, 1, 2) + UW @ np.sum(VP @ V, axis=0) @ np.swapaxes(UW, 1, 2)
@@ -348,9 +335,8 @@ def _to_all(run: Poses) -> tuple[Similarity, Squares]:
     positions = run.estimates[:, :n, n], run.truths[:, :n, n]
     fit = similarity(*positions, scaled=run.align == "sim3", yaw=yaw)
     if not yaw and (line := _line(run)) is not None:
-        fit = turned_about(fit, line, run.estimates, run.truths)
-    P = run.covariances if run.joint is None else run.joint
-    return fit, projected(run.estimates, P, run.align, line)
+        fit = turned_about(fit, line, run)
+    return fit, projected(run, line)
 
 
 def _line(run: Poses) -> Float[np.ndarray, " n"] | None:

@@ -37,6 +37,8 @@ _KEYS = (
 )  # fmt: skip
 
 
+Place = Sequence[int | np.integer] | np.ndarray
+"""The numbers of a run, and of a step."""
 ASYMMETRY = 0.1
 """The largest asymmetry of a covariance, in σ of its axes: a filter in float32 makes less. What is
 evaluated is its symmetric part."""
@@ -87,7 +89,7 @@ def check_every_run(logged: Mask) -> None:
         raise ValueError(f"run {run} is all NaN; every run needs at least one step")
 
 
-def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
+def at(place: Place) -> str:
     """Name a place as `run 3, step 17`, counted from 0."""
     return f"run {place[0]}, step {place[1]}"
 
@@ -251,10 +253,10 @@ def whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) 
     return result
 
 
-def _whitened(e: Tangents, P: Squares, place: Callable[[int], Sequence[int]]) -> Tangents:
+def _whitened(e: Tangents, P: Squares, place: Callable[[np.integer], Place]) -> Tangents:
     """The same of a row of errors, of which `place` tells run and step."""
 
-    def refuse(k: int, fault: str) -> NoReturn:
+    def refuse(k: np.integer, fault: str) -> NoReturn:
         must = "it must be symmetric and positive definite"
         raise ValueError(f"the covariance of {at(place(k))} {fault}; {must}")
 

@@ -43,7 +43,7 @@ from jaxslam.evaluation.convention import (
     write_covariances,
 )  # fmt: skip
 from jaxslam.evaluation.convention_search import Tried, identify
-from jaxslam.evaluation.inputs import checked_poses
+from jaxslam.evaluation.inputs import Poses, checked_poses
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
@@ -451,7 +451,8 @@ def diagonal(blocks):
 
 def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
     T, P = some(SPATIAL, (5,), 2), np.stack([covariance(6, seed) for seed in range(5)])
-    one, other = (projected(T, x, align="sim3") for x in (P, diagonal(P)))
+    poses = Poses(T, P, T, np.ones(5, bool), SPLIT, align="sim3")
+    one, other = projected(poses), projected(poses._replace(joint=diagonal(P)))
     np.testing.assert_allclose(one, other, atol=1e-12)
     U = gauge_directions(T, "sim3")
     V = U.copy()

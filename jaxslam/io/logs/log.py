@@ -152,7 +152,7 @@ def symmetric(
 
 
 def interpolated(
-    times: Times, poses: Stack, at: Times, *, beyond: bool = False
+    times: Float[np.ndarray, " m"], poses: Stack, at: Times, *, beyond: bool = False
 ) -> Float[np.ndarray, "n d d"]:
     """Poses between those of increasing `times`: positions linearly, rotations along the shortest.
 
