@@ -153,8 +153,13 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
     W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
     `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
-    P, U = run.covariances, gauge_directions(run.estimates, run.align)
-    V = _fitted(U, line)
+    P, U, n = run.covariances, gauge_directions(run.estimates, run.align), run.truths.shape[-1] - 1
+    V = U.copy()  # of the errors that the fit leaves as they are, Σ Vᵀ e = 0
+    V[:, n:] = 0
+    if line is not None:
+        about = np.outer(line, line)
+        V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
+        V[:, 3:, 3:6] = about
     VP = np.swapaxes(V, 1, 2) @ P
     if run.joint is not None:
         blocks = run.joint.reshape(*P.shape[:2], *P.shape[:2])
@@ -162,19 +167,6 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
     lost = UW @ VP
     return P - lost - np.swapaxes(lost, 1, 2) + UW @ np.sum(VP @ V, axis=0) @ np.swapaxes(UW, 1, 2)
-
-
-def _fitted(
-    U: Float[np.ndarray, "k t g"], line: Float[np.ndarray, " 3"] | None
-) -> Float[np.ndarray, "k t g"]:
-    """Return V of the errors that a fit leaves as they are, `Σ Vᵀ e = 0`."""
-    n, V = 2 if U.shape[1] == 3 else 3, U.copy()
-    V[:, n:] = 0
-    if line is not None:
-        about = np.outer(line, line)
-        V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
-        V[:, 3:, 3:6] = about
-    return V
 
 
 def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.ndarray, "k t g"]:

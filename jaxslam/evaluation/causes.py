@@ -60,8 +60,7 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
     turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
     looks = (*((_w_first,) if turns else ()), _worlds, _tilt, _mounting)
     for look in (*looks, *((_half_angles,) if turns else ())):
-        mistake = look(poses, found)
-        if mistake is not None:
+        if mistake := look(poses, found):
             yield mistake
             return
 
@@ -82,11 +81,6 @@ def _nees(found: Evaluation) -> float:
 def _instead(fixed: Evaluation, found: Evaluation) -> str:
     """The NEES without a cause, and with it."""
     return f"NEES is {_nees(fixed):.4g} instead of {_nees(found):.4g}"
-
-
-def _mean_rotation(R: Float[np.ndarray, "k n n"]) -> Float[np.ndarray, "n n"]:
-    """The rotation nearest to their mean."""
-    return nearest_rotation(R.mean(axis=0))
 
 
 def _rms(values: np.ndarray) -> float:
@@ -122,7 +116,7 @@ def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
     def off(T: Matrices, true: Matrices) -> float:
         turn = np.swapaxes(T[there][:, :3, :3], 1, 2) @ true[there][:, :3, :3]
         # Up to a constant, as of another world or body.
-        return float(np.median(angles(turn, _mean_rotation(turn))))
+        return float(np.median(angles(turn, nearest_rotation(turn.mean(axis=0)))))
 
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
@@ -245,19 +239,15 @@ def _mounted(poses: Poses, X: Float[np.ndarray, "d d"], *, lever: bool) -> Float
     if not lever and n == 3:
         X[:n, :n] = _by_increments(poses)
     for _ in range(ROUNDS):
-        world = _in_world(poses._replace(truths=poses.truths @ np.linalg.inv(X)))
+        unmounted = poses._replace(truths=poses.truths @ np.linalg.inv(X), used=())
+        world = aligned(unmounted).poses
         between = np.linalg.inv(world.estimates[there]) @ world.truths[there]
         step = np.eye(n + 1)
-        step[:n, :n] = _mean_rotation(between[:, :n, :n])
+        step[:n, :n] = nearest_rotation(between[:, :n, :n].mean(axis=0))
         if lever:
             step[:n, n] = _lever_arm(world)
         X = step @ X
     return X
-
-
-def _in_world(poses: Poses) -> Poses:
-    """Aligned, by all axes."""
-    return aligned(poses._replace(used=())).poses
 
 
 def _lever_arm(world: Poses) -> Float[np.ndarray, " n"]:
@@ -306,7 +296,7 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
     n = poses.estimates.shape[-1] - 1
     R = poses.estimates[:, :, :n, :n][poses.logged]
     axis = poses.truths[:, :, :n, :n][poses.logged] @ np.swapaxes(R, 1, 2)
-    constant = angles(axis, _mean_rotation(axis))
+    constant = angles(axis, nearest_rotation(axis.mean(axis=0)))
     in_world = turns.any() and _rms(constant) < 0.5 * angle
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
     explained = (ratio > LESS) & (ratio > LESS * left)
@@ -315,7 +305,7 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
 
 def _in_all_runs(X: Float[np.ndarray, "d d"], unmounted: Poses) -> bool:
     """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
-    n, moved = len(X) - 1, _in_world(unmounted)
+    n, moved = len(X) - 1, aligned(unmounted._replace(used=())).poses
     if len(moved.logged) < FEWEST:
         return False
 

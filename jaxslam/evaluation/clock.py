@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import nearest_rotation
-from jaxslam.io.logs.log import interpolated, turns
+from jaxslam.io.logs.log import Log, interpolated, turns
 
 FURTHEST = 0.5
 """The largest offset that is looked for, s."""
@@ -38,19 +38,15 @@ class Offset(NamedTuple):
         return abs(self.seconds) > max(BEYOND * self.sigma, 1e-4)
 
 
-def clock_offset(
-    times: Float[np.ndarray, " n"],
-    estimates: Float[np.ndarray, "n d d"],
-    true_times: Float[np.ndarray, " m"],
-    truths: Float[np.ndarray, "m d d"],
-) -> Offset | None:
+def clock_offset(estimate: Log, truth: Log) -> Offset | None:
     """The offset by least squares; None where rotations do not determine it.
 
     Of a grid as fine as the truth the best one, refined by a parabola through its neighbours.
     """
     (times, estimates), (true_times, truths) = (
-        (t[~np.isnan(T[:, 0, 0])], T[~np.isnan(T[:, 0, 0])])
-        for t, T in ((times, estimates), (true_times, truths))
+        (x.times[there], x.poses[there])
+        for x in (estimate, truth)
+        for there in [~np.isnan(x.poses[:, 0, 0])]
     )
     if len(true_times) < _LEAST or len(times) < _LEAST:
         return None

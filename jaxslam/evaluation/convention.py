@@ -255,9 +255,7 @@ def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
     return jnp.concatenate([truth.translation() - estimate.translation(), turn])
 
 
-def _truth_derivatives(
-    error: str, estimate: Pose, truth: Pose, first: Pose
-) -> tuple[Float[Array, "t t"], Float[Array, "t t"]]:
+def _truth_derivatives(error: str, estimate: Pose, truth: Pose, first: Pose) -> tuple[Array, Array]:
     by_truth = jacobian(lambda T: _error(error, estimate, T), truth)
     return by_truth, jacobian(lambda F: _error(error, F @ first.inverse() @ estimate, truth), first)
 

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, one_line, read_arrays
-from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import (
     BLOCK,
     CHOICES,
@@ -30,12 +29,6 @@ from jaxslam.io.logs.log import check_seconds, symmetric
 from jaxslam.io.text import read_table, vector_of
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
-
-_KEYS = (
-    "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
-    "times", "names", *CHOICES,
-)  # fmt: skip
-
 
 Place = Sequence[int | np.integer] | np.ndarray
 """The numbers of a run, and of a step."""
@@ -133,9 +126,7 @@ def padded(
     return e, P, there.sum(axis=-1)
 
 
-def of_one_dof(
-    values: PerStep, dof: Float[np.ndarray, "runs steps"]
-) -> tuple[PerStep, int, tuple[str, ...]]:
+def of_one_dof(values: PerStep, dof: PerStep) -> tuple[PerStep, int, tuple[str, ...]]:
     """NIS of many degrees of freedom as those of one, the median, of the same probability.
 
     Where they are so improbable that it cannot be told, they grow in proportion.
@@ -179,15 +170,13 @@ def exactly_known(covariances: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarr
     return ~np.any(covariances, axis=(-2, -1))
 
 
-def without_known(
-    errors: PerAxis, covariances: Squares, logged: Mask
-) -> tuple[int, Mask, tuple[str, ...]]:
+def without_known(errors: PerAxis, P: Squares, logged: Mask) -> tuple[int, Mask, tuple[str, ...]]:
     """The steps that were logged, but for those that a run knows by definition at its beginning:
     the first at which any run has one, a mask of them, and a word on what is known.
 
     Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
-    known = exactly_known(covariances) & logged
+    known = exactly_known(P) & logged
     if (known == logged).all():
         raise ValueError("all covariances are zero; they must be positive definite")
     largest = np.abs(errors).max(axis=-1)
@@ -198,7 +187,7 @@ def without_known(
             "frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
     # In part: what such a pose knows exactly has no degree of freedom.
-    variance = np.diagonal(covariances, axis1=-2, axis2=-1)
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
     in_part = (variance == 0) & (np.abs(errors) <= ROUNDING)
     in_part = in_part.any(axis=-1) & (in_part == (variance == 0)).all(axis=-1)
     before = np.logical_and.accumulate(known | in_part | ~logged, axis=1)
@@ -431,20 +420,8 @@ def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
     return T
 
 
-ARRAYS = (".npz", ".mat")
-
-
-def read_arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, or a mat file of MATLAB up to version 7; nothing in it is run."""
-    arrays = _read_mat(path) if path.suffix == ".mat" else read_arrays(path)
-    for name in arrays:
-        if name not in _KEYS:
-            meant = suggestion(name, _KEYS)
-            raise ValueError(f"{path}: unknown array {name!r}{meant}; known: {', '.join(_KEYS)}")
-    return arrays
-
-
-def _read_mat(path: Path) -> dict[str, np.ndarray]:
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a mat file of MATLAB up to version 7; nothing in it is run."""
     from scipy.io import loadmat  # slow to import
 
     try:
@@ -463,6 +440,8 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
     return {name: value.ravel() if name == "times" else value for name, value in arrays.items()}
 
 
+ARRAYS = {".npz": read_arrays, ".mat": read_mat}
+"""What reads the arrays of a file."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
 """First words of a table without a column of runs."""

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
 from jaxslam.evaluation.causes import suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
-from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
+from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_csv
 from jaxslam.evaluation.pairing import (
     Place,
     RunFiles,
@@ -35,6 +36,10 @@ _CONTENTS = (
     "(or σ instead of covariances), or nees or nis with dof"
 )
 _ALONE = ("nees", "nis")
+_KEYS = (
+    "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
+    "times", "names", *CHOICES,
+)  # fmt: skip
 Options = dict[str, Any]
 """The options for evaluating poses, see `evaluate_poses`."""
 Names = Sequence[str]
@@ -102,8 +107,8 @@ def evaluate_log(
 
 
 def _of_arrays(source: Path, stated: dict[str, str], how: Options, nis: bool) -> Evaluation:
-    read = (read_arrays_of(source), (), ()) if source.suffix in ARRAYS else read_csv(source)
-    arrays, runs, steps = read
+    read = ARRAYS.get(source.suffix)
+    arrays, runs, steps = (read(source), (), ()) if read else read_csv(source)
     found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
     told = (advice(found),) if found.quantity == "NIS" and found.names else ()
     return described(found, run_names=runs, notes=(*found.notes, *told))
@@ -122,6 +127,8 @@ def _evaluate_arrays(
     arrays: dict[str, np.ndarray], stated: dict[str, str], how: Options, nis: bool
 ) -> Evaluation:
     """The verdict on errors, innovations or poses, by the names of the arrays."""
+    for name in arrays:
+        lookup("array", name, dict.fromkeys(_KEYS))
     held = [name for name in (*_ALONE, "errors", "innovations", "estimates") if name in arrays]
     if "sigmas" in arrays and "covariances" not in arrays:
         arrays = {**arrays, "covariances": of_sigmas(arrays["sigmas"])}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
@@ -79,10 +79,8 @@ class RunLogs:
     @cached_property
     def offset(self) -> Offset | None:
         """By how much the estimate is late, by its rotations."""
-        own, true = self.estimate, self.truth
-        if not self.oriented or not own.stamped:
-            return None
-        return clock_offset(own.times, own.poses, true.times, true.poses)
+        told = self.oriented and self.estimate.stamped
+        return clock_offset(self.estimate, self.truth) if told else None
 
 
 class RunLog(NamedTuple):
@@ -243,9 +241,7 @@ def _stamped_by(times: Float[np.ndarray, " n"], own: Log) -> Log:
     return own._replace(times=times, notes=(*own.notes, note))
 
 
-def _nearest(
-    times: Float[np.ndarray, " n"], others: Float[np.ndarray, " m"], values: np.ndarray
-) -> tuple[np.ndarray, Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def _nearest(times: Times, others: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
     """The values of other times at ours, NaN where there is none; and which belong together."""
     at, of = associated(times, others)
     result = np.full((len(times), *values.shape[1:]), np.nan)
@@ -254,10 +250,8 @@ def _nearest(
     return result, at, of
 
 
-def _nothing_in_common(
-    run: RunFiles, other: Place, times: np.ndarray, others: np.ndarray
-) -> ValueError:
-    spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, others))
+def _nothing_in_common(run: RunFiles, other: Place, *times: np.ndarray) -> ValueError:
+    spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in times)
     return ValueError(
         f"{run.estimate} and {other} have no time stamps in common {_WITHIN}: {spans}"
     )
@@ -382,9 +376,7 @@ def _sigmas(log: Log) -> Float[np.ndarray, " 2"]:
     return np.maximum(least, 1e-12)
 
 
-def _at_stamps_of_truth(
-    log: Log, times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m d d"]
-) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"]]:
+def _at_stamps_of_truth(log: Log, times: Times, poses: np.ndarray) -> tuple[Matrices, Matrices]:
     """The estimates nearest to true poses, interpolated to their stamps, and those truths."""
     between = (times >= log.times[0]) & (times <= log.times[-1])
     times, poses = times[between], poses[between]

@@ -86,8 +86,7 @@ def _identified(poses: Poses) -> Identification:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                other = poses._replace(convention=convention)
-                result[convention] = _tried(compared(other), _log_volume(other))
+                result[convention] = _tried(poses._replace(convention=convention))
         return result
 
     # With one axis of rotation mixed and rpy are world, as in the plane.
@@ -100,25 +99,20 @@ def _identified(poses: Poses) -> Identification:
     return identify(stated, tried(same), lambda: tried(given))
 
 
-def _log_volume(poses: Poses) -> float:
-    """The log determinant of a covariance along the convention's axes over that of orthogonal ones:
-    angles that follow one another are not."""
-    if poses.convention.axes != "rpy":
-        return 0.0
-    volume = np.linalg.slogdet(turning(poses.convention, poses.estimates[poses.logged]))[1]
-    return 2 * float(volume.mean())
-
-
-def _tried(found: Evaluation, log_volume: float) -> Tried:
+def _tried(poses: Poses) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
+    found = compared(poses)
     turns, parts = np.array([name.startswith("r") for name in found.names]), {}
     for what, block in (("position", ~turns), ("rotation", turns)):
         if block.any():
             e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
             nees = filled(squared(whitened(e, P)), found.logged, np.nan)
             parts[what] = nees, int(block.sum())
-    log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
-    return Tried(found.nees, found.dof, found.fitted, log_determinant - log_volume, parts)
+    volume = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
+    if poses.convention.axes == "rpy":  # angles that follow one another are not orthogonal
+        N = turning(poses.convention, poses.estimates[poses.logged])
+        volume -= 2 * float(np.linalg.slogdet(N)[1].mean())
+    return Tried(found.nees, found.dof, found.fitted, volume, parts)
 
 
 def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:

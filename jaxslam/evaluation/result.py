@@ -138,7 +138,12 @@ class Evaluation:
     def _of_nees(self) -> Verdict:
         with np.errstate(over="ignore"):
             z = self.errors / self.sigmas
-            return _as_assumed(self._verdict(z, self.whitened, self.dof, self.fitted), self.notes)
+            found = self._verdict(z, self.whitened, self.dof, self.fitted)
+        # σ may seem wrong because errors of different poses are taken as independent.
+        wrong = found["word"] in ("over-confident", "under-confident")
+        as_assumed = 1 / ASSUMED < (found["sigma_factor"] or 0.0) < ASSUMED
+        doubted = INDEPENDENT in self.notes and wrong and as_assumed
+        return found | {"word": "cannot tell"} if doubted else found
 
     def _verdict(self, normalised: PerAxis, whitened: PerAxis, dof: int, fitted: float) -> Verdict:
         """The verdict on whitened errors, which are over their σ `normalised`."""
@@ -279,55 +284,7 @@ class Evaluation:
 
     def asdict(self) -> dict[str, Json]:
         """The content of `evaluation.json`."""
-        from jaxslam._version import __version__
-
-        names, bias, found = [*enumerate(self.names)], self.bias, self.correlation
-        outside, rmse, sigma = self.outside3sigma, self.rmse, self.sigma
-        return {
-            "schema": 1,
-            "version": __version__,
-            "quantity": self.quantity,
-            "runs": self.runs,
-            "steps": self.steps,
-            "dof": self.dof,
-            "time": json_numbers(self.times),
-            "band95": list(self.band95),
-            "nees": json_numbers(self.mean),
-            "runs_of_step": self.runs_of_step.tolist(),
-            "band95_of_step": self.band95_of_step.tolist(),
-            "inside": self.inside,
-            "verdict": self.verdict,
-            "run_names": list(self.run_names),
-            "lost_runs": self.lost_runs,
-            "outside3sigma": {name: float(outside[i]) for i, name in names},
-            "rmse": {name: json_numbers(rmse[:, i]) for i, name in names},
-            "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
-            "axis_verdict": {name: self.axis_verdict(i) for i, name in names},
-            "coverage": self.coverage,
-            "effective_samples": self._of_nees.get("effective"),
-            "time_offset": self.time_offset
-            and dict(zip(("seconds", "sigma"), self.time_offset, strict=True)),
-            "causes": [
-                {"cause": x.what, "evidence": x.told, "nees_without": x.nees} for x in self.mistakes
-            ],
-            "bias": bias
-            and {x: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, x in names},
-            "correlation": found
-            and {
-                "matrix": found.matrix.tolist(),
-                "axes": [self.names[i] for i in found.axes],
-                "p": found.p,
-            },
-            "convention": self.convention and asdict(self.convention),
-            "alignment": self.alignment,
-            "truth_sigma": self.truth_sigma and list(self.truth_sigma),
-            "fitted": self.fitted,
-            "scale": self.scale and self.scale.asdict(),
-            "suggested": self.suggested and asdict(self.suggested),
-            "identified": self.identified and self.identified.asdict(),
-            "mistakes": [mistake.told for mistake in self.mistakes],
-            "notes": self.remarks,
-        }
+        return _as_json(self)
 
     to_dict = asdict
 
@@ -389,6 +346,59 @@ def _told(evaluation: Evaluation) -> str:
     return "\n".join(told)
 
 
+def _as_json(evaluation: Evaluation) -> dict[str, Json]:
+    from jaxslam._version import __version__
+
+    names, bias, found = [*enumerate(evaluation.names)], evaluation.bias, evaluation.correlation
+    outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
+    return {
+        "schema": 1,
+        "version": __version__,
+        "quantity": evaluation.quantity,
+        "runs": evaluation.runs,
+        "steps": evaluation.steps,
+        "dof": evaluation.dof,
+        "time": json_numbers(evaluation.times),
+        "band95": list(evaluation.band95),
+        "nees": json_numbers(evaluation.mean),
+        "runs_of_step": evaluation.runs_of_step.tolist(),
+        "band95_of_step": evaluation.band95_of_step.tolist(),
+        "inside": evaluation.inside,
+        "verdict": evaluation.verdict,
+        "run_names": list(evaluation.run_names),
+        "lost_runs": evaluation.lost_runs,
+        "outside3sigma": {name: float(outside[i]) for i, name in names},
+        "rmse": {name: json_numbers(rmse[:, i]) for i, name in names},
+        "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
+        "axis_verdict": {name: evaluation.axis_verdict(i) for i, name in names},
+        "coverage": evaluation.coverage,
+        "effective_samples": evaluation._of_nees.get("effective"),
+        "time_offset": evaluation.time_offset
+        and dict(zip(("seconds", "sigma"), evaluation.time_offset, strict=True)),
+        "causes": [
+            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
+            for x in evaluation.mistakes
+        ],
+        "bias": bias
+        and {x: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, x in names},
+        "correlation": found
+        and {
+            "matrix": found.matrix.tolist(),
+            "axes": [evaluation.names[i] for i in found.axes],
+            "p": found.p,
+        },
+        "convention": evaluation.convention and asdict(evaluation.convention),
+        "alignment": evaluation.alignment,
+        "truth_sigma": evaluation.truth_sigma and list(evaluation.truth_sigma),
+        "fitted": evaluation.fitted,
+        "scale": evaluation.scale and evaluation.scale.asdict(),
+        "suggested": evaluation.suggested and asdict(evaluation.suggested),
+        "identified": evaluation.identified and evaluation.identified.asdict(),
+        "mistakes": [mistake.told for mistake in evaluation.mistakes],
+        "notes": evaluation.remarks,
+    }
+
+
 def described(found: Evaluation, **words: Any) -> Evaluation:
     """The same errors with other words about them, times, or causes."""
     result = replace(found, **words)
@@ -396,16 +406,6 @@ def described(found: Evaluation, **words: Any) -> Evaluation:
         if name in found.__dict__:
             result.__dict__[name] = found.__dict__[name]
     return result
-
-
-def _as_assumed(found: Verdict, notes: Sequence[str]) -> Verdict:
-    """No verdict on a σ that may seem wrong because errors of different poses are taken as
-    independent, for the gauge of all positions."""
-    factor = found["sigma_factor"]
-    wrong = found["word"] in ("over-confident", "under-confident") and factor is not None
-    if INDEPENDENT in notes and wrong and 1 / ASSUMED < factor < ASSUMED:
-        return found | {"word": "cannot tell"}
-    return found
 
 
 def _html(evaluation: Evaluation, told: str) -> str:
@@ -593,9 +593,8 @@ def evaluate_nees(
             f"{values.shape}"
         )
     check_every_run(~np.isnan(values))
-    if (values < 0).any():
-        run, step = np.argwhere(values < 0)[0]
-        raise ValueError(f"{quantity} of {at((run, step))} is {values[run, step]:.3g}; 0 or more")
+    for place in np.argwhere(values < 0)[:1]:
+        raise ValueError(f"{quantity} of {at(place)} is {values[tuple(place)]:.3g}; 0 or more")
     none = np.empty((*values.shape, 0))
     values, one, notes = of_one_dof(values, each)
     return Evaluation(
