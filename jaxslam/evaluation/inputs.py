@@ -322,7 +322,7 @@ class Poses(NamedTuple):
         return self.at((slice(None), steps))
 
     def later(self, start: int, logged: Mask) -> Poses:
-        """Those from a step on that are to be compared."""
+        """Those from a step on that have a part in the verdict."""
         t, there = self.covariances.shape[-1], logged[:, start:]
         joint = None if self.joint is None else self.joint[:, start * t :, start * t :]
         poses = self.at((slice(None), slice(start, None)), joint)
