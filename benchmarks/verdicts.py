@@ -27,9 +27,10 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.evaluation import evaluate
+from jaxslam.evaluation.comparison import compared
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.inputs import checked_poses
-from jaxslam.evaluation.poses import PoseComparison, as_stated, evaluate_poses
+from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, exp
 from jaxslam.statistics import PowerSums, Tally, not_disproved
 from jaxslam.statistics.verdict import THIRDS
@@ -532,7 +533,7 @@ def _circle(runs: int, steps: int) -> np.ndarray:
 def judged_drift(kind: str, drift: float, options: ScaleDrift, seed: int) -> tuple[str, bool]:
     """The word on a set, and whether the drift was named."""
     poses = checked_poses(*drifting(kind, drift, options, seed), SPLIT)
-    found = as_stated(poses, PoseComparison("sim3"))
+    found = compared(poses._replace(align="sim3"))
     if found.scale is None:
         raise RuntimeError("a Sim(3) has a scale")
     return found.verdict["word"], found.scale.disproved

@@ -7,8 +7,7 @@ on strong evidence, with a number and the NEES without it; then there is no verd
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -22,7 +21,8 @@ from jaxslam.evaluation.alignment import (
     similarity,
 )
 from jaxslam.evaluation.clock import increments
-from jaxslam.evaluation.convention import Matrices, geometry_of
+from jaxslam.evaluation.comparison import compared
+from jaxslam.evaluation.convention import Matrices
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.sanity_checks import Mistake
@@ -30,8 +30,6 @@ from jaxslam.io.tum import poses as poses_of
 from jaxslam.io.tum import quaternions
 from jaxslam.statistics.verdict import not_disproved
 
-Compared = Callable[[Poses, str, Sequence[str]], Evaluation]
-"""The evaluation of poses with an alignment, along some axes, or as stated with none."""
 ROUNDS = 8
 """Alignments, and fits of the mounting, in turn."""
 UNDETERMINED = 0.05
@@ -51,37 +49,18 @@ FEWEST, ALPHA = 4, 1e-3
 """The fewest runs that a constant can be common to, and the chance that one is found of none."""
 
 
-class _Case(NamedTuple):
-    """Poses whose errors are larger than σ says, and how they were compared."""
-
-    poses: Poses
-    align: str
-    found: Evaluation
-    compared: Compared
-
-    def again(self, poses: Poses, axes: Sequence[str] = ()) -> Evaluation:
-        """The evaluation of other poses in the same way."""
-        return self.compared(poses, self.align, axes)
-
-    def instead(self, fixed: Evaluation) -> str:
-        """The NEES without a cause, and with it."""
-        return f"NEES is {_nees(fixed):.4g} instead of {_nees(self.found):.4g}"
-
-
-def causes(poses: Poses, align: str, found: Evaluation, compared: Compared) -> Iterator[Mistake]:
+def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
     """The causes of an evaluation that found a filter over-confident; none of others."""
     yield from _repeated(poses)
     if not suspect(found) or poses.convention.scale == "given":
         return
     few = poses.some()
     if few is not poses:
-        poses, found = few, compared(few, align, ())
-    case = _Case(poses, align, found, compared)
+        poses, found = few, compared(few)
     turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
     looks = (*((_w_first,) if turns else ()), _worlds, _tilt, _mounting)
     for look in (*looks, *((_half_angles,) if turns else ())):
-        mistake = look(case)
-        if mistake is not None:
+        if mistake := look(poses, found):
             yield mistake
             return
 
@@ -99,9 +78,9 @@ def _nees(found: Evaluation) -> float:
     return float(np.mean(found.nees[found.logged]))
 
 
-def _mean_rotation(R: Float[np.ndarray, "k n n"]) -> Float[np.ndarray, "n n"]:
-    """The rotation nearest to their mean."""
-    return nearest_rotation(R.mean(axis=0))
+def _instead(fixed: Evaluation, found: Evaluation) -> str:
+    """The NEES without a cause, and with it."""
+    return f"NEES is {_nees(fixed):.4g} instead of {_nees(found):.4g}"
 
 
 def _rms(values: np.ndarray) -> float:
@@ -131,13 +110,13 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
                 return
 
 
-def _w_first(case: _Case) -> Mistake | None:
-    poses, there = case.poses, case.poses.logged
+def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
+    there = poses.logged
 
     def off(T: Matrices, true: Matrices) -> float:
         turn = np.swapaxes(T[there][:, :3, :3], 1, 2) @ true[there][:, :3, :3]
         # Up to a constant, as of another world or body.
-        return float(np.median(angles(turn, _mean_rotation(turn))))
+        return float(np.median(angles(turn, nearest_rotation(turn.mean(axis=0)))))
 
     before = off(poses.estimates, poses.truths)
     if before < np.radians(20):
@@ -147,11 +126,11 @@ def _w_first(case: _Case) -> Mistake | None:
         ("truth", poses._replace(truths=_reread(poses.truths, there))),
     ):
         if off(changed.estimates, changed.truths) < before / 4:
-            fixed = case.again(changed)
+            fixed = compared(changed)
             return Mistake(
                 f"quaternions of the {name} have w first",
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
-                f"the {name} read as qw qx qy qz {case.instead(fixed)}; write qx qy qz qw, or "
+                f"the {name} read as qw qx qy qz {_instead(fixed, found)}; write qx qy qz qw, or "
                 "name the columns",
                 _nees(fixed),
             )
@@ -166,11 +145,10 @@ def _reread(T: Matrices, there: np.ndarray) -> Matrices:
     return result
 
 
-def _worlds(case: _Case) -> Mistake | None:
+def _worlds(poses: Poses, found: Evaluation) -> Mistake | None:
     """Positions that agree after an alignment, by a large rotation or of first poses apart."""
-    if case.align != "none":
+    if poses.align != "none":
         return None
-    poses, found = case.poses, case.found
     n = poses.estimates.shape[-1] - 1
     try:
         rows = [
@@ -185,11 +163,11 @@ def _worlds(case: _Case) -> Mistake | None:
         return None
     by = "yaw" if n == 3 and tilt < np.radians(2) else "se3"
     by = "sim3" if scaled < left / LESS else by
-    fixed = case.compared(poses, by, ())
+    fixed = compared(poses._replace(align=by))
     return Mistake(
         "estimate and truth are not in one world",
         f"positions differ by {rms:.3g} m (RMS) and by {left:.3g} m once aligned, by "
-        f"{np.degrees(angle):.3g}°: with --align {by} {case.instead(fixed)}",
+        f"{np.degrees(angle):.3g}°: with --align {by} {_instead(fixed, found)}",
         _nees(fixed),
     )
 
@@ -204,71 +182,75 @@ def _apart(p: Float[np.ndarray, "k n"], true: Float[np.ndarray, "k n"]) -> list[
     return [*(_rms(x - true) for x in (p, *moved)), first, float(angles(R, np.eye(len(R)))), tilt]
 
 
-def _tilt(case: _Case) -> Mistake | None:
+def _tilt(poses: Poses, found: Evaluation) -> Mistake | None:
     """An alignment of roll and pitch, which the filter observes; or of yaw alone, in two worlds."""
-    if case.poses.estimates.shape[-1] != 4 or case.align not in ("se3", "yaw"):
+    others = {
+        "se3": ("yaw", "the filter knows roll and pitch, which se3 aligns too"),
+        "yaw": ("se3", "the verticals of both worlds differ"),
+    }
+    if poses.estimates.shape[-1] != 4 or poses.align not in others:
         return None
-    other = "yaw" if case.align == "se3" else "se3"
-    fixed = case.compared(case.poses, other, ())
-    if not _right(fixed) or _nees(fixed) > _nees(case.found) / 1.2:
+    other, why = others[poses.align]
+    fixed = compared(poses._replace(align=other))
+    if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
         return None
-    why = (
-        "the filter knows roll and pitch, which se3 aligns too"
-        if other == "yaw"
-        else "the verticals of both worlds differ"
-    )
-    told = f"{why}: with --align {other} {case.instead(fixed)}"
-    return Mistake(f"an alignment by {case.align}", told, _nees(fixed))
+    told = f"{why}: with --align {other} {_instead(fixed, found)}"
+    return Mistake(f"an alignment by {poses.align}", told, _nees(fixed))
 
 
-def _mounting(case: _Case) -> Mistake | None:
+def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     """A constant X between the bodies, `T = W T̂ X`: its rotation, and its lever arm."""
-    best, X = case.found, np.eye(case.poses.estimates.shape[-1])
+    best, X, moved = found, np.eye(poses.estimates.shape[-1]), poses
     for lever, gain in ((False, 1.5), (True, 1.2)):
-        other = _fitted(case, X, lever=lever)
-        fixed = case.again(_unmounted(case.poses, other))
+        other = _mounted(poses, X, lever=lever)
+        unmounted = poses._replace(truths=poses.truths @ np.linalg.inv(other))
+        fixed = compared(unmounted)
         if _nees(fixed) < _nees(best) / gain:
-            best, X = fixed, other
-    if best is case.found:
+            best, X, moved = fixed, other, unmounted
+    if best is found:
         return None
-    n, moved = len(X) - 1, _unmounted(case.poses, X)
+    n = len(X) - 1
     angle, metres = float(angles(X[:n, :n], np.eye(n))), float(np.linalg.norm(X[:n, n]))
-    if not _of_body(case, best, angle) and not (_right(best) and _in_all_runs(X, case, moved)):
+    certain = _of_body(poses, found, best, angle)
+    if not certain and not (_right(best) and _in_all_runs(X, moved)):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
     parts += [f"a lever arm of {metres:.3g} m"] if metres > 0 else []
+    turns = tuple(name for name in found.names if name.startswith("r"))
+    of = {"position": tuple(x for x in found.names if x not in turns), "rotation": turns}
+    alone = [
+        f"{what} {_nees(compared(moved._replace(used=axes))):.3g} of {len(axes)}"
+        for what, axes in of.items()
+        if axes
+    ]
+    by_part = f" ({', '.join(alone)})" if len(alone) > 1 else ""
     return Mistake(
         "estimate and truth are of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
-        f"{case.instead(best)}{_by_part(case, moved)}; give the truth of the body that is "
-        "estimated",
+        f"{_instead(best, found)}{by_part}; give the truth of the body that is estimated",
         _nees(best),
     )
 
 
-def _fitted(case: _Case, X: Float[np.ndarray, "d d"], *, lever: bool) -> Float[np.ndarray, "d d"]:
+def _mounted(poses: Poses, X: Float[np.ndarray, "d d"], *, lever: bool) -> Float[np.ndarray, "d d"]:
     """X by least squares, of alignments and fits in turn; its rotation from that of increments."""
-    n, there = len(X) - 1, case.poses.logged
+    n, there = len(X) - 1, poses.logged
     X = X.copy()
     if not lever and n == 3:
-        X[:n, :n] = _by_increments(case.poses)
+        X[:n, :n] = _by_increments(poses)
     for _ in range(ROUNDS):
-        world = _in_world(case, _unmounted(case.poses, X))
+        unmounted = poses._replace(truths=poses.truths @ np.linalg.inv(X), used=())
+        world = aligned(unmounted).poses
         between = np.linalg.inv(world.estimates[there]) @ world.truths[there]
         step = np.eye(n + 1)
-        step[:n, :n] = _mean_rotation(between[:, :n, :n])
+        step[:n, :n] = nearest_rotation(between[:, :n, :n].mean(axis=0))
         if lever:
-            step[:n, n] = _lever_arm(world, case.align)
+            step[:n, n] = _lever_arm(world)
         X = step @ X
     return X
 
 
-def _in_world(case: _Case, poses: Poses) -> Poses:
-    axes = np.arange(geometry_of(poses.estimates).tangent_dim)
-    return aligned(poses, case.align, axes).poses
-
-
-def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
+def _lever_arm(world: Poses) -> Float[np.ndarray, " n"]:
     """The arm l of `p = p̂ + R̂ l` by least squares of positions, whose alignment goes with it.
 
     Zero along directions that the rotations do not determine.
@@ -278,9 +260,9 @@ def _lever_arm(world: Poses, align: str) -> Float[np.ndarray, " n"]:
     for estimates, truths, there in zip(world.estimates, world.truths, world.logged, strict=True):
         T, off = estimates[there], (truths - estimates)[there, :n, n]
         own = np.column_stack([T[:, :n, :n].reshape(-1, n), off.ravel()])
-        if align != "none":
+        if world.align != "none":
             T[:, :n, n] -= T[:, :n, n].mean(axis=0)
-            U = gauge_directions(T, align)[:, :n].reshape(len(own), -1)
+            U = gauge_directions(T, world.align)[:, :n].reshape(len(own), -1)
             own -= U @ np.linalg.lstsq(U, own)[0]
         rows.append(own)
     both = np.concatenate(rows)
@@ -300,42 +282,32 @@ def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) if singular[1] < UNDETERMINED * singular[0] else nearest_rotation(M)
 
 
-def _by_part(case: _Case, poses: Poses) -> str:
-    """The NEES of position and of rotation by themselves."""
-    turns = [name for name in case.found.names if name.startswith("r")]
-    parts = {"position": [x for x in case.found.names if x not in turns], "rotation": turns}
-    told = [
-        f"{what} {_nees(case.again(poses, axes)):.3g} of {len(axes)}"
-        for what, axes in parts.items()
-        if axes
-    ]
-    return f" ({', '.join(told)})" if len(told) > 1 else ""
-
-
-def _of_body(case: _Case, fixed: Evaluation, angle: float) -> bool:
+def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -> bool:
     """Whether the constant is one of a body beyond doubt, and leaves little to be explained.
 
     A constant error of a filter is one in its world, where a turn moves positions as well: it is
     one of the body if positions are no worse for it, or the body turns against its world.
     """
-    poses, turns = case.poses, np.array([name.startswith("r") for name in case.found.names])
+    turns = np.array([name.startswith("r") for name in found.names])
     ratio, left = (
         np.sqrt(np.mean((x.errors[x.logged] / x.sigmas[x.logged]) ** 2, axis=0))
-        for x in (case.found, fixed)
+        for x in (found, fixed)
     )
     n = poses.estimates.shape[-1] - 1
     R = poses.estimates[:, :, :n, :n][poses.logged]
     axis = poses.truths[:, :, :n, :n][poses.logged] @ np.swapaxes(R, 1, 2)
-    constant = angles(axis, _mean_rotation(axis))
+    constant = angles(axis, nearest_rotation(axis.mean(axis=0)))
     in_world = turns.any() and _rms(constant) < 0.5 * angle
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
     explained = (ratio > LESS) & (ratio > LESS * left)
     return bool(explained.any() and left.max() < UNEXPLAINED and not (in_world and few))
 
 
-def _in_all_runs(X: Float[np.ndarray, "d d"], case: _Case, unmounted: Poses) -> bool:
+def _in_all_runs(X: Float[np.ndarray, "d d"], unmounted: Poses) -> bool:
     """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
-    n, moved = len(X) - 1, _in_world(case, unmounted)
+    n, moved = len(X) - 1, aligned(unmounted._replace(used=())).poses
+    if len(moved.logged) < FEWEST:
+        return False
 
     def parts(T: Matrices) -> np.ndarray:
         S = T[:, :n, :n] - np.swapaxes(T[:, :n, :n], 1, 2)
@@ -345,23 +317,15 @@ def _in_all_runs(X: Float[np.ndarray, "d d"], case: _Case, unmounted: Poses) -> 
     each = np.array(
         [parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs]
     )
-    if len(each) < FEWEST:
-        return False
     t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
     return bool(2 * scipy.special.stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
-def _unmounted(poses: Poses, X: Float[np.ndarray, "d d"]) -> Poses:
-    """With truths of the body that is estimated, `T X⁻¹`."""
-    moved = poses.truths @ np.linalg.inv(X)
-    return poses._replace(truths=np.where(poses.logged[..., None, None], moved, poses.truths))
-
-
-def _half_angles(case: _Case) -> Mistake | None:
+def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
     """Covariances of the vector part of a quaternion: σ of all rotations is half, and no other."""
     off: dict[float, list[float]] = {1.0: [], 2.0: []}
-    for i, name in enumerate(case.found.names):
-        verdict, factor = case.found.axis_verdict(i), 2.0 if name.startswith("r") else 1.0
+    for i, name in enumerate(found.names):
+        verdict, factor = found.axis_verdict(i), 2.0 if name.startswith("r") else 1.0
         (low, high), own = verdict["interval99"], verdict["sigma_factor"]
         if not own or (low or 0.0) > 1.05 * factor or (high or np.inf) < 0.95 * factor:
             return None
@@ -370,16 +334,14 @@ def _half_angles(case: _Case) -> Mistake | None:
     for part in filter(None, off.values()):
         if abs(np.mean(part)) > np.log(HALF) or np.ptp(part) > 3 * np.log(HALF):
             return None
-    names: Sequence[str] = case.poses.convention.names(geometry_of(case.poses.estimates))
-    scale = np.array([2.0 if name.startswith("r") else 1.0 for name in names])
-    P = scale[:, None] * case.poses.covariances * scale
-    fixed = case.again(case.poses._replace(covariances=P))
+    scale = np.array([2.0 if name.startswith("r") else 1.0 for name in poses.names])
+    fixed = compared(poses._replace(covariances=scale[:, None] * poses.covariances * scale))
     if not _right(fixed):
         return None
     return Mistake(
         "half angles",
         "σ of all rotations is half of the right one, and that of positions right, as if the "
         f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
-        f"header {case.instead(fixed)}. If they are of angles, the filter is over-confident",
+        f"header {_instead(fixed, found)}. If they are of angles, the filter is over-confident",
         _nees(fixed),
     )

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import nearest_rotation
-from jaxslam.io.logs.log import interpolated
+from jaxslam.io.logs.log import Log, interpolated, turns
 
 FURTHEST = 0.5
 """The largest offset that is looked for, s."""
@@ -38,19 +38,15 @@ class Offset(NamedTuple):
         return abs(self.seconds) > max(BEYOND * self.sigma, 1e-4)
 
 
-def clock_offset(
-    times: Float[np.ndarray, " n"],
-    estimates: Float[np.ndarray, "n d d"],
-    true_times: Float[np.ndarray, " m"],
-    truths: Float[np.ndarray, "m d d"],
-) -> Offset | None:
+def clock_offset(estimate: Log, truth: Log) -> Offset | None:
     """The offset by least squares; None where rotations do not determine it.
 
     Of a grid as fine as the truth the best one, refined by a parabola through its neighbours.
     """
     (times, estimates), (true_times, truths) = (
-        (t[~np.isnan(T[:, 0, 0])], T[~np.isnan(T[:, 0, 0])])
-        for t, T in ((times, estimates), (true_times, truths))
+        (x.times[there], x.poses[there])
+        for x in (estimate, truth)
+        for there in [~np.isnan(x.poses[:, 0, 0])]
     )
     if len(true_times) < _LEAST or len(times) < _LEAST:
         return None
@@ -100,13 +96,5 @@ def _sigma(before: np.ndarray, now: np.ndarray, after: np.ndarray, apart: float)
 
 def increments(T: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "k r"]:
     """The rotation vectors from each pose to the next; NaN where one of both is."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    n = T.shape[-1] - 1
-    turn = np.swapaxes(T[:-1, :n, :n], 1, 2) @ T[1:, :n, :n]
-    if n == 2:
-        return np.arctan2(turn[:, 1, 0], turn[:, 0, 0])[:, None]
-    there = ~np.isnan(turn).any(axis=(1, 2))
-    result = np.full((len(turn), 3), np.nan)
-    result[there] = Rotation.from_matrix(turn[there]).as_rotvec()
-    return result
+    vectors = turns(T[:-1], T[1:])
+    return vectors if T.shape[-1] == 4 else vectors[:, 2:]

@@ -124,7 +124,7 @@ def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention
     )
 
 
-def geometry_of(poses: Matrices) -> Geometry:
+def geometry_of(poses: Matrices | Array) -> Geometry:
     """The geometry of matrices (…, 3, 3) or (…, 4, 4)."""
     return SPATIAL if poses.shape[-1] == 4 else PLANAR
 
@@ -171,16 +171,12 @@ def from_right(convention: Convention, estimates: Matrices) -> Squares:
 
 def converted(covariances: Squares, poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Convert covariances of poses from one convention to another."""
-    T, P = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
-    transport(P.reshape(-1, *P.shape[-2:]), lambda part: change(T[part], old, new))
-    return P
-
-
-def transport(P: Float[np.ndarray, "k t t"], derivative: Callable[[slice], Squares]) -> None:
-    """Replace every P by `J P Jᵀ`, with the J of a part of them at once."""
+    T, result = poses.reshape(-1, *poses.shape[-2:]), np.array(covariances, np.float64, order="C")
+    P = result.reshape(-1, *result.shape[-2:])
     for part in blocks(len(P)):
-        J = derivative(part)
+        J = change(T[part], old, new)
         P[part] = J @ P[part] @ np.swapaxes(J, -1, -2)
+    return result
 
 
 def change(poses: Matrices, old: Convention, new: Convention) -> Squares:
@@ -235,9 +231,7 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
     return np.cross(p[..., None, :], np.eye(3))
 
 
-def _in_float64(
-    function: Callable[..., Result], error: str, *arrays: Float[np.ndarray, "*batch _ _"]
-) -> Result:
+def _in_float64(function: Callable[..., Result], error: str, *arrays: Matrices) -> Result:
     """Apply a function of single poses to all of them, as NumPy's arrays.
 
     Their number is filled up to a power of two, so that few programs serve logs of all sizes.
@@ -247,7 +241,7 @@ def _in_float64(
     more = (1 << (count - 1).bit_length()) - count
     filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
     with jax.enable_x64(True):
-        result = jax.device_get(_of_each(function, error, geometry_of(arrays[0]), *filled))
+        result = jax.device_get(_of_each(function, error, *filled))
     return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
 
 
@@ -261,18 +255,14 @@ def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
     return jnp.concatenate([truth.translation() - estimate.translation(), turn])
 
 
-def _truth_derivatives(
-    error: str, estimate: Pose, truth: Pose, first: Pose
-) -> tuple[Float[Array, "t t"], Float[Array, "t t"]]:
+def _truth_derivatives(error: str, estimate: Pose, truth: Pose, first: Pose) -> tuple[Array, Array]:
     by_truth = jacobian(lambda T: _error(error, estimate, T), truth)
     return by_truth, jacobian(lambda F: _error(error, F @ first.inverse() @ estimate, truth), first)
 
 
 @eqx.filter_jit
-def _of_each(
-    function: Callable[..., Result], error: str, geometry: Geometry, *matrices: Matrices | Array
-) -> Result:
-    of = geometry.group.from_matrix
+def _of_each(function: Callable[..., Result], error: str, *matrices: Matrices | Array) -> Result:
+    of = geometry_of(matrices[0]).group.from_matrix
     return jax.vmap(lambda *T: function(error, *map(of, T)))(*matrices)
 
 
@@ -288,13 +278,8 @@ class CovarianceText(NamedTuple):
 
     times: Float[np.ndarray, " n"]
     covariances: Float[np.ndarray, "n t t"]
-    said: dict[str, str]
-    """The words of its header that are of a `Convention`."""
-
-    @property
-    def convention(self) -> Convention:
-        """The convention of the header, and the default where it is silent."""
-        return Convention(**self.said)
+    convention: Convention
+    """The convention of the header, and the default where it is silent."""
 
 
 def write_covariances(
@@ -327,34 +312,35 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     word of the header that is not known.
     """
     found = covariances_of_file(path, t)
-    return CovarianceText(found.times, found.covariances, dict(found.said))
+    return CovarianceText(found.times, found.covariances, Convention(**found.said))
 
 
 def covariances_of_file(path: str | Path, t: int = 6) -> Log:
     """The same, as a log without poses."""
-    triangle = t * (t + 1) // 2
+    triangle = 1 + t * (t + 1) // 2
     kinds = {
-        1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
+        triangle: f"{triangle} finite numbers, the time and the upper triangle row by row",
         1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row",
         1 + t: f"{1 + t} finite numbers, the time and a σ for each axis",
     }
-    table = read_table(path, "covariances", "covariances", kinds[1 + triangle])
-    count, of_names, rows = table.rows.shape[1], named.read(table), table.rows
+    table = read_table(path, "covariances", "covariances", kinds[triangle])
+    of_names, rows = named.read(table), table.rows
     if of_names is not None and len(of_names.covariances):
         return of_names
-    deviations = t == 6 and is_deviations(rows)
-    expected = kinds.get(count, kinds[1 + triangle])
+    count, deviations = rows.shape[1], t == 6 and is_deviations(rows)
     if deviations:
-        expected = f"{count} finite numbers, OpenVINS's time and deviations"
-    there = ~without_values(rows)
-    wrong = ~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1)
-    table.check(wrong if wrong.any() else wrong | (not deviations and count not in kinds), expected)
+        kinds[count] = f"{count} finite numbers, OpenVINS's time and deviations"
+    there, expected = ~without_values(rows), kinds.get(count, kinds[triangle])
+    table.check(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1), expected)
+    table.check([count not in kinds], expected)
     said, unit = _said(table, MIXED if deviations else {})
     P = np.full((len(rows), t, t), np.nan)
     times, notes = in_seconds(table, rows[:, 0])
     if deviations or count == 1 + t:
         sigma = rows[there][:, [4, 5, 6, 1, 2, 3] if deviations else range(1, 1 + t)]
-        P[there] = _squared(path, sigma)[:, :, None] * np.eye(t)
+        for wrong in sigma[~((sigma >= 0) & (sigma <= LARGEST))][:1]:
+            raise ValueError(f"{path}: a σ is {wrong:.3g}; expected 0 to {LARGEST:.0e}")
+        P[there] = sigma[:, :, None] ** 2 * np.eye(t)
     elif count == 1 + t * t:
         P[there] = rows[there, 1:].reshape(-1, t, t)
     else:
@@ -365,9 +351,7 @@ def covariances_of_file(path: str | Path, t: int = 6) -> Log:
     return Log(times, np.empty((0, 4, 4)), scale[:, None] * P * scale, said, notes)
 
 
-def _of_triangle(
-    path: str | Path, values: Float[np.ndarray, "n k"], t: int
-) -> tuple[Float[np.ndarray, "n t t"], tuple[str, ...]]:
+def _of_triangle(path: str | Path, values: np.ndarray, t: int) -> tuple[Squares, tuple[str, ...]]:
     """Covariances of upper triangles row by row; or column by column, where only so they are any.
 
     Column by column is also a lower triangle row by row.
@@ -386,13 +370,6 @@ def _of_triangle(
         "column; taken as that"
     )
     return by_column, (note,)
-
-
-def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n t"]:
-    wrong = ~((sigma >= 0) & (sigma <= LARGEST))
-    if wrong.any():
-        raise ValueError(f"{path}: a σ is {sigma[wrong][0]:.3g}; expected 0 to {LARGEST:.0e}")
-    return sigma**2
 
 
 def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], float]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -46,22 +47,19 @@ class Tried(NamedTuple):
     """The most degrees of freedom that a fit took from every NEES."""
     log_determinant: float = 0.0
     """The log determinant of the covariances, on average."""
-    position: PerStep | None = None
-    """The NEES of the position alone, where there is one."""
-    rotation: PerStep | None = None
-    turns: int = 0
-    """The number of axes of the rotation."""
+    parts: Mapping[str, tuple[PerStep, int]] = MappingProxyType({})
+    """The NEES of `position` and of `rotation` alone, where there are such axes, and their
+    degrees of freedom."""
 
     def last(self, steps: int) -> Tried:
         """Return the same of the last steps alone."""
-        parts = (self.position, self.rotation)
-        position, rotation = (None if x is None else x[:, -steps:] for x in parts)
-        return self._replace(nees=self.nees[:, -steps:], position=position, rotation=rotation)
+        parts = {what: (nees[:, -steps:], dof) for what, (nees, dof) in self.parts.items()}
+        return self._replace(nees=self.nees[:, -steps:], parts=parts)
 
     @property
     def finite(self) -> bool:
-        parts = (self.nees, self.position, self.rotation)
-        return not any(np.isinf(x).any() for x in parts if x is not None)
+        parts = (self.nees, *(nees for nees, _ in self.parts.values()))
+        return not any(np.isinf(x).any() for x in parts)
 
     @property
     def whole(self) -> bool:
@@ -71,13 +69,11 @@ class Tried(NamedTuple):
     @property
     def consistent(self) -> bool:
         """Whether nothing is proven against it."""
-        position = (self.position, self.dof - self.turns, self.fitted)
-        parts = position, (self.rotation, self.turns, 0.0)
         # The confidence of what is said against position or rotation alone, after all axes
         # together.
         return self.whole and all(
-            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - 0.999
-            for nees, dof, fitted in parts
+            _verdict(nees, dof, self.fitted * (what == "position"))["p"] >= 1 - 0.999
+            for what, (nees, dof) in self.parts.items()
         )
 
 
@@ -132,36 +128,27 @@ class Identification:
         if not self.consistent:
             return "no other convention of the covariance would make the data consistent"
         alike = _ALIKE if self.consistent[0].error in ("right", "split") else ""
-        if self.suggested is not None:
-            return self._other(self.suggested) + alike
+        doubtful = f"the convention ({self.stated}) is doubtful"
+        if (other := self.suggested) is not None:
+            nees = f"NEES {self.nees[other]:.2f}"
+            if self.stands and self.stated in self.nees:
+                nees += f" instead of {self.nees[self.stated]:.2f}"
+                return f"{doubtful}: {other} fits the same runs better, {nees}{alike}"
+            return f"{doubtful}: only with {other} would the data be consistent, {nees}{alike}"
         apart = [str(c) for c in self.consistent if c != self.stated]
-        others = "; ".join(apart[:_TOLD])
-        if len(apart) > _TOLD:
-            others += f"; and {len(apart) - _TOLD} more"
+        more = [f"and {len(apart) - _TOLD} more"] if len(apart) > _TOLD else []
+        others = "; ".join(apart[:_TOLD] + more)
         if self.doubtful:
-            return (
-                f"the convention ({self.stated}) is doubtful, but these fit equally well: {others}"
-            )
+            return f"{doubtful}, but these fit equally well: {others}"
         if others:
             return f"the convention ({self.stated}) cannot be distinguished from: {others}"
         return f"of {len(self.nees)} conventions the stated one ({self.stated}) fits best{alike}"
-
-    def _other(self, other: Convention) -> str:
-        if self.stands and self.stated in self.nees:
-            return (
-                f"the convention ({self.stated}) is doubtful: {other} fits the same runs better, "
-                f"NEES {self.nees[other]:.2f} instead of {self.nees[self.stated]:.2f}"
-            )
-        return (
-            f"the convention ({self.stated}) is doubtful: only with {other} would "
-            f"the data be consistent, NEES {self.nees[other]:.2f}"
-        )
 
     def asdict(self) -> dict[str, Json]:
         """Return the content for `evaluation.json`."""
         return {
             "stated": asdict(self.stated),
-            "convention": None if self.convention is None else asdict(self.convention),
+            "convention": self.convention and asdict(self.convention),
             "consistent": [asdict(c) for c in self.consistent],
             "better": None if self.better is None else asdict(self.better[0]),
             "nees": [asdict(c) | {"nees": nees} for c, nees in self.nees.items()],
@@ -178,31 +165,24 @@ def identify(
     Those `given` the scale are tried where none of the others makes the data consistent.
     """
     finite = _finite(tried)
-    own = finite.get(stated)
-    stands, whole = own is not None and own.consistent, own is not None and own.whole
-    best, equal = _best(finite)
-    better = None if own is None or best is None else _better(own, finite[best])
+    own, (best, equal) = finite.get(stated), _best(finite)
+    better = None
+    if own is not None and best not in (None, stated) and _distinguished(own, finite[best]):
+        lower = np.nanmean(finite[best].nees, axis=1) < np.nanmean(own.nees, axis=1)
+        better = best, int(lower.sum()), len(lower)
     if best is None or not finite[best].consistent:
         free = _finite(given())
-        best_free, equal = _best(free)
+        found, equal = _best(free)
         if (
-            best_free is None
-            or not free[best_free].consistent
-            or (best is not None and not _scale_was_free(finite[best], free[best_free]))
+            found is None
+            or not free[found].consistent
+            or (best is not None and not _scale_was_free(finite[best], free[found]))
         ):
             equal = ()
         finite |= free
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
-    others = (best, *better) if best not in (None, stated) and better and not equal else None
-    return Identification(stated, means, equal, stands, whole, others)
-
-
-def _better(own: Tried, best: Tried) -> tuple[int, int] | None:
-    """In how many runs, and of how many, the best one fits better, if it does beyond doubt."""
-    if not _distinguished(own, best):
-        return None
-    lower = np.nanmean(best.nees, axis=1) < np.nanmean(own.nees, axis=1)
-    return int(lower.sum()), len(lower)
+    stands, whole = own is not None and own.consistent, own is not None and own.whole
+    return Identification(stated, means, equal, stands, whole, None if equal else better)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
@@ -223,10 +203,10 @@ def _best(tried: Mapping[Convention, Tried]) -> tuple[Convention | None, tuple[C
 
 def _scale_was_free(marginal: Tried, given: Tried) -> bool:
     """Whether a fitted scale takes more from the NEES of positions than any wrong σ explains."""
-    n = given.dof - given.turns
-    if n < 2 or marginal.position is None or given.position is None:
+    if "position" not in marginal.parts or "position" not in given.parts:
         return False
-    return _worse(marginal.position, n / (n - 1) * given.position)
+    (nees, n), (fitted, _) = (x.parts["position"] for x in (marginal, given))
+    return n > 1 and _worse(nees, n / (n - 1) * fitted)
 
 
 def _distinguished(other: Tried, best: Tried) -> bool:

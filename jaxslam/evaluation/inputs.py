@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -13,28 +13,25 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, one_line, read_arrays
-from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import (
     BLOCK,
     CHOICES,
+    Axes,
     Convention,
-    Joints,
     Squares,
+    Tangents,
     Values,
     blocks,
     geometry_of,
+    pose_errors,
 )
 from jaxslam.io.logs.log import check_seconds, symmetric
-from jaxslam.io.text import Table, read_table
+from jaxslam.io.text import read_table, vector_of
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
-_KEYS = (
-    "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
-    "times", "names", *CHOICES,
-)  # fmt: skip
-
-
+Place = Sequence[int | np.integer] | np.ndarray
+"""The numbers of a run, and of a step."""
 ASYMMETRY = 0.1
 """The largest asymmetry of a covariance, in σ of its axes: a filter in float32 makes less. What is
 evaluated is its symmetric part."""
@@ -58,14 +55,10 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
     return array
 
 
-def check_finite(what: str, array: Float[np.ndarray, ...], logged: Mask | None = None) -> None:
+def check_finite(what: str, array: Values, logged: Mask) -> None:
     """Raise ValueError, naming run and step, for what is not finite at a step that was logged."""
-    wrong = ~np.isfinite(array)
-    if logged is not None:
-        wrong &= logged.reshape(*logged.shape, *[1] * (array.ndim - 2))
-    if wrong.any():
-        place = np.argwhere(wrong)[0]
-        unknown = " (inf is of an axis that is unknown at every pose)" * (array.ndim == 4)
+    unknown = " (inf is of an axis that is unknown at every pose)" * (array.ndim == 4)
+    for place in np.argwhere(~np.isfinite(filled(array, logged, 0.0)))[:1]:
         raise ValueError(
             f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers{unknown}"
         )
@@ -85,12 +78,11 @@ def filled(array: Values, logged: Mask, value: ArrayLike) -> Values:
 
 def check_every_run(logged: Mask) -> None:
     """Raise ValueError for a run of which no step was logged."""
-    if not logged.any(axis=1).all():
-        run = int(np.argmin(logged.any(axis=1)))
+    for run in np.flatnonzero(~logged.any(axis=1))[:1]:
         raise ValueError(f"run {run} is all NaN; every run needs at least one step")
 
 
-def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
+def at(place: Place) -> str:
     """Name a place as `run 3, step 17`, counted from 0."""
     return f"run {place[0]}, step {place[1]}"
 
@@ -134,9 +126,7 @@ def padded(
     return e, P, there.sum(axis=-1)
 
 
-def of_one_dof(
-    values: PerStep, dof: Float[np.ndarray, "runs steps"]
-) -> tuple[PerStep, int, tuple[str, ...]]:
+def of_one_dof(values: PerStep, dof: PerStep) -> tuple[PerStep, int, tuple[str, ...]]:
     """NIS of many degrees of freedom as those of one, the median, of the same probability.
 
     Where they are so improbable that it cannot be told, they grow in proportion.
@@ -163,11 +153,8 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     """The time of every step in seconds; its number where times are unknown. Raises ValueError."""
     if times is None:
         return np.arange(1.0, steps + 1)
-    try:
-        array = np.empty(0) if np.iscomplexobj(times) else np.asarray(times, np.float64)
-    except (ValueError, TypeError):
-        array = np.empty(0)
-    if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
+    array = None if np.iscomplexobj(times) else vector_of(times, steps)
+    if array is None or not np.isfinite(array).all() or (np.diff(array) < 0).any():
         raise ValueError(
             f"times must be {steps} finite, non-decreasing values in seconds, one per step"
         )
@@ -183,32 +170,28 @@ def exactly_known(covariances: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarr
     return ~np.any(covariances, axis=(-2, -1))
 
 
-def without_known(
-    errors: PerAxis, covariances: Squares, logged: Mask
-) -> tuple[int, Mask, tuple[str, ...]]:
+def without_known(errors: PerAxis, P: Squares, logged: Mask) -> tuple[int, Mask, tuple[str, ...]]:
     """The steps that were logged, but for those that a run knows by definition at its beginning:
     the first at which any run has one, a mask of them, and a word on what is known.
 
     Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
-    known = exactly_known(covariances) & logged
+    known = exactly_known(P) & logged
     if (known == logged).all():
         raise ValueError("all covariances are zero; they must be positive definite")
-    wrong = known & (np.abs(errors).max(axis=-1) > ROUNDING)
-    if wrong.any():
-        run, step = np.argwhere(wrong)[0]
+    largest = np.abs(errors).max(axis=-1)
+    for place in np.argwhere(known & (largest > ROUNDING))[:1]:
         raise ValueError(
-            f"the covariance of {at((run, step))} is zero, and its error is not: "
-            f"{np.abs(errors[run, step]).max():.3g}; it must be positive definite, and "
-            "poses in another frame or unit than the truth's need an alignment (--align se3, sim3)"
+            f"the covariance of {at(place)} is zero, and its error is not: "
+            f"{largest[tuple(place)]:.3g}; it must be positive definite, and poses in another "
+            "frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
     # In part: what such a pose knows exactly has no degree of freedom.
-    variance = np.diagonal(covariances, axis1=-2, axis2=-1)
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
     in_part = (variance == 0) & (np.abs(errors) <= ROUNDING)
     in_part = in_part.any(axis=-1) & (in_part == (variance == 0)).all(axis=-1)
     before = np.logical_and.accumulate(known | in_part | ~logged, axis=1)
-    if before.all(axis=1).any():
-        run = int(np.argmax(before.all(axis=1)))
+    for run in np.flatnonzero(before.all(axis=1))[:1]:
         raise ValueError(
             f"all covariances of run {run} are zero, or zero on an axis without errors; they must "
             "be positive definite"
@@ -252,52 +235,40 @@ def whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) 
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
     """
-    steps = max(BLOCK // len(errors), 1) if errors.ndim == 3 else BLOCK
-    if errors.shape[-2] <= steps:
-        return _whitened(errors, covariances)
-    result = np.empty_like(errors)
-    try:
-        for part in blocks(errors.shape[-2], steps):
-            of = (..., part, slice(None))
-            result[of] = _whitened(errors[of], covariances[(*of, slice(None))])
-    except ValueError:  # which names run and step of a part
-        return _whitened(errors, covariances)
+    (*_, steps, n), result = errors.shape, np.empty(errors.shape)
+    e, P, z = errors.reshape(-1, n), covariances.reshape(-1, n, n), result.reshape(-1, n)
+    for part in blocks(len(e), BLOCK):
+        z[part] = _whitened(e[part], P[part], lambda k, part=part: divmod(part.start + k, steps))
     return result
 
 
-def _whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerAxis:
-    variance = np.diagonal(covariances, axis1=-2, axis2=-1)
-    if (variance <= 0).any():
-        run, step, axis = np.argwhere(variance <= 0)[0]
-        _refuse((run, step), f"has variance {variance[run, step, axis]:.3g} at place {axis}")
-    sigma = sigmas(covariances)
+def _whitened(e: Tangents, P: Squares, place: Callable[[np.integer], Place]) -> Tangents:
+    """The same of a row of errors, of which `place` tells run and step."""
+
+    def refuse(k: np.integer, fault: str) -> NoReturn:
+        must = "it must be symmetric and positive definite"
+        raise ValueError(f"the covariance of {at(place(k))} {fault}; {must}")
+
+    variance = np.diagonal(P, axis1=1, axis2=2)
+    for k, axis in np.argwhere(variance <= 0)[:1]:
+        refuse(k, f"has variance {variance[k, axis]:.3g} at place {axis}")
     with np.errstate(over="ignore"):
-        correlation = correlations(covariances)
-    if not np.isfinite(correlation).all():
-        place = tuple(np.argwhere(~np.isfinite(correlation))[0])
-        _refuse(place[:2], f"has {covariances[place]:.3g} where its variances allow less")
-    skewed = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(axis=(-2, -1))
-    if (skewed > ASYMMETRY).any():
-        place = np.argwhere(skewed > ASYMMETRY)[0]
-        _refuse(place, f"is not symmetric (by {skewed[tuple(place)]:.2g} in σ)")
-    correlation = (correlation + np.swapaxes(correlation, -1, -2)) / 2
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite: of a run that diverged
-        return np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
-
-
-def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:
+        correlation = correlations(P)
+    for k, *entry in np.argwhere(~np.isfinite(correlation))[:1]:
+        refuse(k, f"has {P[k, *entry]:.3g} where its variances allow less")
+    transposed = np.swapaxes(correlation, 1, 2)
+    skewed = np.abs(correlation - transposed).max(axis=(1, 2))
+    for k in np.flatnonzero(skewed > ASYMMETRY)[:1]:
+        refuse(k, f"is not symmetric (by {skewed[k]:.2g} in σ)")
+    correlation = (correlation + transposed) / 2
     try:
-        return np.linalg.cholesky(correlation)
+        L = np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
-        least = np.linalg.eigvalsh(correlation)[..., 0]
-        place = np.argwhere(least <= max(float(least.min()), 0.0))[0]
-        _refuse(place, f"has an eigenvalue {least[tuple(place)]:.3g} times its variances")
-
-
-def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoReturn:
-    raise ValueError(
-        f"the covariance of {at(place)} {fault}; it must be symmetric and positive definite"
-    )
+        least = np.linalg.eigvalsh(correlation)[:, 0]
+        k = np.flatnonzero(least <= max(float(least.min()), 0.0))[0]
+        refuse(k, f"has an eigenvalue {least[k]:.3g} times its variances")
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite: of a run that diverged
+        return np.linalg.solve(L, (e / np.sqrt(variance))[..., None])[..., 0]
 
 
 MOST = 20_000
@@ -305,7 +276,7 @@ MOST = 20_000
 
 
 class Poses(NamedTuple):
-    """Runs of estimated poses T_wc, their covariances, and the truth."""
+    """Runs of estimated poses T_wc, their covariances, the truth, and how they are compared."""
 
     estimates: Float[np.ndarray, "runs steps d d"]
     covariances: Float[np.ndarray, "runs steps t t"]
@@ -316,6 +287,30 @@ class Poses(NamedTuple):
     """The errors that the covariances are of."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
+    align: str = "none"
+    used: tuple[str, ...] = ()
+    """The names of the axes that are compared; none where they are to be found."""
+    truth_sigma: tuple[float, float] | None = None
+    """The σ of the true poses, m and degrees; None of exact ones."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all axes, in the order of a covariance."""
+        return self.convention.names(geometry_of(self.estimates))
+
+    @property
+    def axes(self) -> Axes:
+        """The places of the axes that are compared, or of all."""
+        return np.array([i for i, x in enumerate(self.names) if x in (self.used or self.names)])
+
+    def errors(self) -> Tangents:
+        """The exact errors of the stated kind, along these axes."""
+        return pose_errors(self.convention, self.estimates, self.truths)[..., self.axes]
+
+    def along_axes(self) -> Squares:
+        """The covariances of these errors."""
+        axes, P = self.axes, self.covariances
+        return P if len(axes) == P.shape[-1] else P[..., axes[:, None], axes]
 
     def some(self) -> Poses:
         """Steps of equal distances, with the first one of every run: `MOST` poses, or all."""
@@ -326,18 +321,24 @@ class Poses(NamedTuple):
         steps = np.union1d(np.arange(0, self.logged.shape[1], every), first)
         return self.at((slice(None), steps))
 
+    def later(self, start: int, logged: Mask) -> Poses:
+        """Those from a step on that have a part in the verdict."""
+        t, there = self.covariances.shape[-1], logged[:, start:]
+        joint = None if self.joint is None else self.joint[:, start * t :, start * t :]
+        poses = self.at((slice(None), slice(start, None)), joint)
+        return poses._replace(covariances=filled(poses.covariances, there, np.eye(t)), logged=there)
+
     def at(self, places: tuple[Any, ...], joint: np.ndarray | None = None) -> Poses:
         """Those at some places, and their joint covariance."""
-        arrays = self.estimates, self.covariances, self.truths, self.logged
-        T, P, truths, logged = (x[places] for x in arrays)
-        return Poses(T, P, truths, logged, self.convention, joint)
+        T, P, truths, logged, *compared = self
+        arrays = (x[places] for x in (T, P, truths, logged))
+        return Poses(*arrays, *compared)._replace(joint=joint)
 
 
 def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
     """The diagonal covariances of σ (runs, steps, n). Raises ValueError for a negative one."""
     sigma = numbers("sigmas", sigmas, 3, "(runs, steps, n)")
-    if (sigma < 0).any():
-        place = np.argwhere(sigma < 0)[0]
+    for place in np.argwhere(sigma < 0)[:1]:
         raise ValueError(
             f"sigmas of {at(place)} must not be negative, not {sigma[tuple(place)]:.3g}"
         )
@@ -372,15 +373,22 @@ def checked_poses(
     logged = ~(all_nan(T[..., :-1, :]) | all_nan(P) | all_nan(truth[..., :-1, :]))
     check_every_run(logged)
     if joints is not None:
-        joints = _joint(joints, np.repeat(logged, t, axis=1))
+        rows = np.repeat(logged, t, axis=1)
+        joints = np.where(rows[:, :, None] & rows[:, None], joints, 0.0)
+        for run, *_ in np.argwhere(~(np.abs(joints) <= LARGEST))[:1]:
+            told = f"numbers that are not finite, or beyond {LARGEST:.0e}"
+            raise ValueError(f"covariances of run {run} hold {told}")
     for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
         check_finite(what, x, logged)
         known = filled(x, logged, 0.0)
         if (largest := max(known.max(), -known.min())) > LARGEST:
             raise ValueError(f"{what} contain {largest:.2g}; the limit is {LARGEST:.0e}")
     T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
-    _check_rigid("estimates", T)
-    _check_rigid("truths", truth)
+    for what, x in (("estimates", T), ("truths", truth)):
+        # The tolerance of a rotation's orthonormality: rounding to six digits makes less.
+        for place in np.argwhere(not_rigid(x, 1e-4))[:1]:
+            told = "is not a rigid motion [R t; 0 1] with a rotation R"
+            raise ValueError(f"{what} of {at(place)} {told}")
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, convention, joints)
 
 
@@ -393,22 +401,8 @@ def without_unknown(P: Squares, *, marked: bool = True) -> Squares:
     unknown = ((marked & (variance == -1)) | (variance >= UNKNOWN) | ~there).all(axis=(0, 1))
     if not unknown.any() or unknown.all():
         return P
-    P, axes = P.copy(), np.flatnonzero(unknown)
-    P[..., axes, :] = np.where(np.isnan(P[..., axes, :]), np.nan, 0.0)
-    P[..., :, axes] = np.where(np.isnan(P[..., :, axes]), np.nan, 0.0)
-    P[..., axes, axes] = np.where(np.isnan(P[..., axes, axes]), np.nan, UNKNOWN)
-    return P
-
-
-def _joint(P: Joints, logged: Bool[np.ndarray, "runs k"]) -> Joints:
-    """Zero the covariance of steps not logged. Raises ValueError for non-finite or huge numbers."""
-    P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
-    if not (np.abs(P) <= LARGEST).all():
-        run = int(np.argwhere(~(np.abs(P) <= LARGEST))[0, 0])
-        raise ValueError(
-            f"covariances of run {run} hold numbers that are not finite, or beyond {LARGEST:.0e}"
-        )
-    return P
+    alone = np.where(np.isnan(P), np.nan, np.diag(np.where(unknown, UNKNOWN, 0.0)))
+    return np.where(unknown | unknown[:, None], alone, P)
 
 
 def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
@@ -426,28 +420,8 @@ def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
     return T
 
 
-def _check_rigid(what: str, T: np.ndarray) -> None:
-    # The tolerance of a rotation's orthonormality: rounding to six digits makes less.
-    wrong = not_rigid(T, 1e-4)
-    if wrong.any():
-        place = at(np.argwhere(wrong)[0])
-        raise ValueError(f"{what} of {place} is not a rigid motion [R t; 0 1] with a rotation R")
-
-
-ARRAYS = (".npz", ".mat")
-
-
-def read_arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, or a mat file of MATLAB up to version 7; nothing in it is run."""
-    arrays = _read_mat(path) if path.suffix == ".mat" else read_arrays(path)
-    for name in arrays:
-        if name not in _KEYS:
-            meant = suggestion(name, _KEYS)
-            raise ValueError(f"{path}: unknown array {name!r}{meant}; known: {', '.join(_KEYS)}")
-    return arrays
-
-
-def _read_mat(path: Path) -> dict[str, np.ndarray]:
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a mat file of MATLAB up to version 7; nothing in it is run."""
     from scipy.io import loadmat  # slow to import
 
     try:
@@ -466,19 +440,12 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
     return {name: value.ravel() if name == "times" else value for name, value in arrays.items()}
 
 
+ARRAYS = {".npz": read_arrays, ".mat": read_mat}
+"""What reads the arrays of a file."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
 """First words of a table without a column of runs."""
 _SIGMA = re.compile(r"(σ|sigma|std|sd)", re.IGNORECASE)
-
-
-class _Columns(NamedTuple):
-    """Where a table has what: so many columns before, n of errors, and what the others are."""
-
-    before: int
-    n: int
-    kind: str
-    """`upper`, `full` or `σ` of covariances; `nees` or `nis`, which is followed by `dof`."""
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[str, ...]]:
@@ -499,21 +466,23 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
             f"{path}: {rows.shape[1]} columns{told}; expected {row}: {_COLUMNS} columns; or all n² "
             "numbers, n σ named sigma…, or nees and dof by these names. A trajectory needs --truth"
         )
-    _check_rows(table, found, row)
     before, n, kind = found
+    errors, P = (np.isnan(x) for x in np.split(rows[:, before:], [max(n, 1)], axis=1))
+    without, finite = errors.all(axis=1) | (P.all(axis=1) & (n > 0)), np.isfinite(rows)
+    table.check(~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1)), row)
     told = rows[:, :2] if before == 2 else np.column_stack([np.zeros(len(rows)), rows[:, 0]])
     places, runs, steps = _rectangle(path, told, lines)
 
-    def placed(values: np.ndarray) -> np.ndarray:
-        result = np.full((len(runs), len(steps), *values.shape[1:]), np.nan)
-        result[places] = values
-        return result
-
+    values = np.full((len(runs), len(steps), rows.shape[1] - before), np.nan)
+    values[places] = rows[:, before:]
     if kind in ("nees", "nis"):
-        arrays = {kind: placed(rows[:, before]), "dof": placed(rows[:, before + 1])}
+        arrays = {kind: values[..., 0], "dof": values[..., 1]}
     else:
-        P = _matrices_of(rows[:, before + n :], n, kind)
-        arrays = {"errors": placed(rows[:, before : before + n]), "covariances": placed(P)}
+        arrays = {"errors": values[..., :n], kind: values[..., n:]}
+        if kind == "covariances":
+            P = values[..., n:].reshape(-1, values.shape[-1] - n)
+            P = P if P.shape[1] == n * n else symmetric(P, np.transpose(np.triu_indices(n)), n)
+            arrays[kind] = P.reshape(len(runs), len(steps), n, n)
         if titles:
             arrays["names"] = np.array(titles[before : before + n])
     return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
@@ -536,44 +505,29 @@ def read_pose_log(
     if wrong:
         expected = f"expected all steps from 1 to {steps} of runs 0 to {runs - 1}"
         raise ValueError(f"{path}: {wrong[0]} is missing or duplicated; {expected}")
-    return logged, arrays["covariances"]
+    return logged, of_sigmas(arrays["sigmas"]) if "sigmas" in arrays else arrays["covariances"]
 
 
-def _check_rows(table: Table, found: _Columns, row: str) -> None:
-    """Raise ValueError, naming the line, unless numbers are finite, or errors or covariances, or
-    NEES, all NaN."""
-    before, n = found.before, max(found.n, 1)
-    errors, P = (np.isnan(x) for x in np.split(table.rows[:, before:], [n], axis=1))
-    without = errors.all(axis=1) | (P.all(axis=1) & (found.n > 0))
-    finite = np.isfinite(table.rows)
-    table.check(~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1)), row)
-
-
-def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:
+def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> tuple[int, int, str] | None:
+    """Where a table has what: so many columns before, n of errors, and what the others are:
+    `covariances` or `sigmas`; or `nees` or `nis`, which is followed by `dof`."""
     low = [title.lower() for title in titles]
     before = 1 if low and low[0] in STEP_FIRST and "run" not in low[1:2] else 2
     left = rows.shape[1] - before
     if low[before:] in (["nees", "dof"], ["nis", "dof"]):
-        return _Columns(before, 0, low[before])
+        return before, 0, low[before]
     half = left // 2
     if left > 0 and left == 2 * half and all(_SIGMA.match(x) for x in low[before + half :]) and low:
-        return _Columns(before, half, "σ")
+        return before, half, "sigmas"
     upper = round((np.sqrt(9 + 8 * left) - 3) / 2) if left > 1 else 0
     full = round((np.sqrt(1 + 4 * left) - 1) / 2) if left > 1 else 0
     if full > 1 and full * (full + 1) == left:
-        P = _matrices_of(rows[:, before + full :], full, "full")
+        P = rows[:, before + full :].reshape(-1, full, full)
         # 20 numbers are 4 and 16, or 5 and a triangle of 15, which is not symmetric so.
         if upper * (upper + 3) != 2 * left or (np.swapaxes(P, 1, 2) == P).all():
-            return _Columns(before, full, "full")
-    return _Columns(before, upper, "upper") if upper and upper * (upper + 3) == 2 * left else None
-
-
-def _matrices_of(told: Float[np.ndarray, "k c"], n: int, kind: str) -> Float[np.ndarray, "k n n"]:
-    if kind == "full":
-        return told.reshape(-1, n, n)
-    if kind == "σ":
-        return of_sigmas(told[None])[0]
-    return symmetric(told, np.transpose(np.triu_indices(n)), n)
+            return before, full, "covariances"
+    of_triangle = upper and upper * (upper + 3) == 2 * left
+    return (before, upper, "covariances") if of_triangle else None
 
 
 def _rectangle(

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
+from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
 from jaxslam.evaluation.causes import suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
-from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
-from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, paired, read_run, with_other
+from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_csv
+from jaxslam.evaluation.pairing import (
+    Place,
+    RunFiles,
+    RunLog,
+    RunLogs,
+    paired,
+    read_run,
+    with_other,
+)
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, described, evaluate, evaluate_nees
 from jaxslam.evaluation.sanity_checks import Mistake
@@ -26,14 +36,14 @@ _CONTENTS = (
     "(or σ instead of covariances), or nees or nis with dof"
 )
 _ALONE = ("nees", "nis")
-
-
-class PoseOptions(TypedDict):
-    """The options for evaluating poses, see `evaluate_poses`."""
-
-    align: str
-    axes_used: str | Sequence[str]
-    truth_sigma: Sequence[float] | None
+_KEYS = (
+    "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
+    "times", "names", *CHOICES,
+)  # fmt: skip
+Options = dict[str, Any]
+"""The options for evaluating poses, see `evaluate_poses`."""
+Names = Sequence[str]
+Runs = tuple[RunFiles, ...]
 
 
 def evaluate_log(
@@ -73,7 +83,7 @@ def evaluate_log(
         raise ValueError("give --nis or --innovations FILE, not both")
     (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
     estimate = estimate or topic or None
-    how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
+    how = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if against is not None and truth is not None:
@@ -88,7 +98,7 @@ def evaluate_log(
         raise ValueError(f"{source}: innovations must be in an npz or CSV file")
     else:
         runs = runs_of(source, covariance, truth, estimate)
-        found = evaluate_runs(source, runs, stated, how, time_offset, against=against is not None)
+        found = _of_runs(source, runs, stated, how, time_offset, against is not None)
     if innovations is None:
         return found
     of_innovations = evaluate_log(innovations, nis=True)
@@ -96,9 +106,9 @@ def evaluate_log(
     return described(found, notes=(*found.notes, f"{told}; {advice(of_innovations, found)}"))
 
 
-def _of_arrays(source: Path, stated: dict[str, str], how: PoseOptions, nis: bool) -> Evaluation:
-    read = (read_arrays_of(source), (), ()) if source.suffix in ARRAYS else read_csv(source)
-    arrays, runs, steps = read
+def _of_arrays(source: Path, stated: dict[str, str], how: Options, nis: bool) -> Evaluation:
+    read = ARRAYS.get(source.suffix)
+    arrays, runs, steps = (read(source), (), ()) if read else read_csv(source)
     found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
     told = (advice(found),) if found.quantity == "NIS" and found.names else ()
     return described(found, run_names=runs, notes=(*found.notes, *told))
@@ -114,9 +124,11 @@ def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
 
 
 def _evaluate_arrays(
-    arrays: dict[str, np.ndarray], stated: dict[str, str], how: PoseOptions, nis: bool
+    arrays: dict[str, np.ndarray], stated: dict[str, str], how: Options, nis: bool
 ) -> Evaluation:
     """The verdict on errors, innovations or poses, by the names of the arrays."""
+    for name in arrays:
+        lookup("array", name, dict.fromkeys(_KEYS))
     held = [name for name in (*_ALONE, "errors", "innovations", "estimates") if name in arrays]
     if "sigmas" in arrays and "covariances" not in arrays:
         arrays = {**arrays, "covariances": of_sigmas(arrays["sigmas"])}
@@ -154,7 +166,7 @@ TEXTS = (".txt", ".csv", ".tum", ".pos", ".smfeval", ".dat", ".g2o")
 
 def runs_of(
     source: Path, covariance: str | Path | None, truth: str | Path | None, estimate: str | None
-) -> tuple[RunFiles, ...]:
+) -> Runs:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
     covariance = None if covariance is None else Path(covariance)
     bags = [source] if ros.is_bag(source) else sorted(filter(ros.is_bag, source.glob("*")))
@@ -193,7 +205,7 @@ def runs_of(
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
-def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles, ...]:
+def _beside_one_truth(source: Path, truth: str | Path | None) -> Runs:
     """Every other trajectory of a folder as a run, with its covariances, against one truth."""
     true = _only(source, TRUTHS) if truth is None else Path(truth)
     files = sorted(x for x in source.glob("*") if x.suffix in TEXTS and x.is_file() and x != true)
@@ -238,82 +250,77 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     return there[0] if there else None
 
 
-def evaluate_runs(
+def _of_runs(
     source: Path,
-    runs: tuple[RunFiles, ...],
+    runs: Runs,
     stated: dict[str, str],
-    how: PoseOptions,
-    time_offset: float | str = 0.0,
-    *,
-    against: bool = False,
+    how: Options,
+    time_offset: float | str,
+    against: bool,
 ) -> Evaluation:
     """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
     `how` are the options of `evaluate_poses`; for the others see `evaluate_log`.
     """
-    read = [paired(read_run(run), time_offset) for run in runs]
-    convention = _convention_of(read, stated)
-    if against:
-        read = [with_other(one, convention) for one in read]
+    logs, names = [read_run(run) for run in runs], tuple(run.name for run in runs)
+    convention, told = _convention_of(logs, stated), []
+    if not all(one.oriented for one in logs) and not how["axes_used"]:
+        how = Options(how, axes_used=("x", "y", "z"))
+        told = ["without orientations: positions alone are compared (--axes-used x,y,z)"]
+
+    def at_offset(offset: float | str) -> list[RunLog]:
+        read = [paired(one, offset) for one in logs]
+        return [with_other(one, convention) for one in read] if against else read
+
+    def compared(read: list[RunLog]) -> Evaluation:
+        times = max((one.times for one in read), key=len)
+        arrays = zip(*((one.estimates, one.covariances, one.truths) for one in read), strict=True)
+        return evaluate_poses(*map(_filled_up, arrays), convention, times=times, **how)
+
+    read = at_offset(time_offset)
     for one in read:
-        if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
+        if one.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
-                f"{one.logs.files.estimate}: its longest map is map {one.evaluated.map}, in a unit "
-                "of its own; use --align sim3"
+                f"{one.logs.files.estimate}: its longest map is map {one.map}, in a unit of its "
+                "own; use --align sim3"
             )
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
-    names = tuple(run.name for run in runs)
-    longest = max(read, key=lambda one: len(one.times))
-    told: tuple[str, ...] = ()
-    if not all(one.logs.oriented for one in read) and not how["axes_used"]:
-        how = {**how, "axes_used": ("x", "y", "z")}
-        told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
     place = runs[0].estimate if len(runs) == 1 else source
-    found = named(place, lambda: _compared(read, convention, how), names)
-    wrong = suspect(found)
-    late = _offset(read) if wrong or time_offset == "auto" else None
+    found = named(place, lambda: compared(read), names)
+    wrong, automatic = suspect(found), time_offset == "auto"
+    late = _offset(logs) if wrong or automatic else None
     if wrong and late is not None and late.found:
-        offset, sigma = late
-        try:
-            fixed = _compared([paired(one.logs, offset) for one in read], convention, how)
-        except ValueError:  # an offset at which few poses have a truth is none of clocks
-            fixed = found
-        before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
-        if after < before / CLEARLY:
-            error = float(f"{1e3 * sigma:.1g}")
-            clock = Mistake(
-                "the clocks of estimate and truth differ",
-                f"the stamps of the estimate are {1e3 * offset:.1f} ± {error:g} ms late, "
-                f"by its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
-                f"instead of {before:.4g}",
-                after,
-            )
-            found = described(found, causes=(clock, *fixed.causes))
+        with suppress(ValueError):  # an offset at which few poses have a truth is none of clocks
+            found = _in_time(found, compared(at_offset(late.seconds)), late)
+        automatic = True
+    if automatic:
         found = described(found, time_offset=late)
-    elif time_offset == "auto":
-        found = described(found, time_offset=late)
-    told += (*_remarks(read), *_other_times(read, longest))
-    if not read[0].logs.covariances.said and not stated:
-        told += (f"the file does not state its convention; assumed: {convention}",)
+    told += _remarks(read)
+    if not logs[0].estimate.said and not stated:
+        told.append(f"the file does not state its convention; assumed: {convention}")
     return described(found, notes=(*found.notes, *told), run_names=names)
 
 
-def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> Evaluation:
-    truths = [np.where(x.evaluated.poses[:, None, None], x.truths, np.nan) for x in read]
-    return evaluate_poses(
-        _filled_up([one.estimates for one in read]),
-        _filled_up([one.covariances for one in read]),
-        _filled_up(truths),
-        convention,
-        times=max((one.times for one in read), key=len),
-        **how,
+def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
+    """The evaluation with the offset of the clocks as the cause, where NEES falls without it."""
+    before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
+    if after >= before / CLEARLY:
+        return found
+    error = float(f"{1e3 * late.sigma:.1g}")
+    clock = Mistake(
+        "the clocks of estimate and truth differ",
+        f"the stamps of the estimate are {1e3 * late.seconds:.1f} ± {error:g} ms late, by its "
+        f"rotations: with --time-offset {late.seconds:.4f} (or auto) NEES is {after:.4g} instead "
+        f"of {before:.4g}",
+        after,
     )
+    return described(found, causes=(clock, *fixed.causes))
 
 
-def _offset(read: list[RunLog]) -> Offset | None:
+def _offset(logs: list[RunLogs]) -> Offset | None:
     """The mean offset of the runs' clocks; None where rotations do not tell it."""
-    told = (one.logs.offset for one in read[:LOOKED_AT])
+    told = (one.offset for one in logs[:LOOKED_AT])
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None
@@ -332,11 +339,18 @@ def _remarks(read: list[RunLog]) -> Iterator[str]:
     shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
     if shortest < longest:
         yield f"runs have {shortest} to {longest} poses"
+    first = max(read, key=lambda one: len(one.times))
+    later = (one.times - first.times[: len(one.times)] for one in read)
+    if any(np.abs(x - x[0]).max() > MAX_TIME_DIFFERENCE for x in later):
+        yield (
+            "steps are counted from the first pose of each run; their times differ between runs, "
+            f"and are those of {first.logs.files.name}"
+        )
 
 
-def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
+def _convention_of(logs: list[RunLogs], stated: dict[str, str]) -> Convention:
     """The convention of all runs. Raises ValueError where their files say different ones."""
-    said = {one.logs.files.of_covariances: one.logs.covariances.said for one in read}
+    said = {one.files.of_covariances: one.estimate.said for one in logs}
     (first, of_first), *others = said.items()
     for place, own in others:
         if own != of_first:
@@ -347,7 +361,7 @@ def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
     return stated_before(of_first, stated)
 
 
-def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
+def _filled_up(runs: Sequence[np.ndarray]) -> np.ndarray:
     """Stack all runs in one array, with NaN behind those that are shorter than the longest."""
     result = np.full((len(runs), max(map(len, runs)), *runs[0].shape[1:]), np.nan)
     for whole, run in zip(result, runs, strict=True):
@@ -363,10 +377,7 @@ def stated_before(said: Mapping[str, str], stated: dict[str, str]) -> Convention
 
 
 def named(
-    source: Place,
-    evaluation: Callable[[], Evaluation],
-    runs: Sequence[str] = (),
-    steps: Sequence[str] = (),
+    source: Place, evaluation: Callable[[], Evaluation], runs: Names = (), steps: Names = ()
 ) -> Evaluation:
     """Evaluate, with the names of file, runs and steps in every error."""
 
@@ -378,20 +389,6 @@ def named(
 
     try:
         found = evaluation()
-        return described(
-            found, causes=tuple(x._replace(told=renamed(x.told)) for x in found.causes)
-        )
     except ValueError as error:
         raise ValueError(f"{source}: {renamed(str(error))}") from None
-
-
-def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
-    """A remark where steps, which are counted, are not at the same times after the first pose."""
-    for one in read:
-        later = one.times - longest.times[: len(one.times)]
-        if np.abs(later - later[0]).max() > MAX_TIME_DIFFERENCE:
-            yield (
-                "steps are counted from the first pose of each run; their times differ between "
-                f"runs, and are those of {longest.logs.files.name}"
-            )
-            return
+    return described(found, causes=tuple(x._replace(told=renamed(x.told)) for x in found.causes))

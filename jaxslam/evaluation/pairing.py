@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
@@ -26,9 +26,9 @@ from jaxslam.evaluation.convention import (
     geometry_of,
 )
 from jaxslam.evaluation.inputs import exactly_known, without_unknown
-from jaxslam.evaluation.tracked_frames import EvaluatedPoses, evaluated_poses
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
+from jaxslam.io.logs.frames import read_frames
 from jaxslam.io.logs.log import Log, check_seconds, interpolated
 from jaxslam.io.tum import Times
 
@@ -62,13 +62,16 @@ class RunFiles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RunLogs:
-    """What the files of a run hold, each with its own stamps."""
+    """What the files of a run hold."""
 
     files: RunFiles
     estimate: Log
+    """With the covariances of its own poses, NaN where there is none."""
     truth: Log
-    covariances: Log
-    """The log itself, or the one of a file of covariances alone."""
+    covariance_times: Times
+    """The stamps of all covariances that there are."""
+    unused: Bool[np.ndarray, " m"]
+    """A mask of those at no time of the estimate."""
     oriented: bool
     """Whether estimate and truth have orientations."""
     notes: tuple[str, ...]
@@ -76,22 +79,20 @@ class RunLogs:
     @cached_property
     def offset(self) -> Offset | None:
         """By how much the estimate is late, by its rotations."""
-        own, true = self.estimate, self.truth
-        if not self.oriented or not own.stamped:
-            return None
-        return clock_offset(own.times, own.poses, true.times, true.poses)
+        told = self.oriented and self.estimate.stamped
+        return clock_offset(self.estimate, self.truth) if told else None
 
 
 class RunLog(NamedTuple):
     """A run, pose by pose of its estimate; NaN where a file holds nothing."""
 
     logs: RunLogs
-    times: Float[np.ndarray, " n"]
-    estimates: Float[np.ndarray, "n d d"]
-    covariances: Float[np.ndarray, "n t t"]
-    truths: Float[np.ndarray, "n d d"]
-    evaluated: EvaluatedPoses
-    """The poses that have a part in the verdict, by the tracker's own record of its frames."""
+    times: Times
+    estimates: Matrices
+    covariances: Squares
+    truths: Matrices
+    map: int
+    """The map that is evaluated, by the tracker's own record of its frames."""
     left_out: dict[str, tuple[int, int]]
     """What is left out: how many, and of how many."""
     notes: tuple[str, ...]
@@ -107,20 +108,15 @@ def read(place: Place) -> Log:
     if 0 < back.sum() <= BACK * len(back):
         log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
-    last = _last_of_each(log.times)
-    doubled = len(log.times) - len(last)
-    told = f"stamps that are doubled: {doubled}; of each the last pose is used"
-    return _of_rows(log, last, told) if doubled else log
+    last = np.append(np.diff(log.times) > 0, True)
+    told = f"stamps that are doubled: {np.sum(~last)}; of each the last pose is used"
+    return log if last.all() else _of_rows(log, last, told)
 
 
-def _of_rows(log: Log, rows: np.ndarray, note: str) -> Log:
+def _of_rows(log: Log, rows: Bool[np.ndarray, " n"], note: str) -> Log:
     P = log.covariances[rows] if len(log.covariances) else log.covariances
     times, poses, notes = log.times[rows], log.poses[rows], (*log.notes, note)
     return log._replace(times=times, poses=poses, covariances=P, notes=notes)
-
-
-def _last_of_each(times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    return np.flatnonzero(np.append(np.diff(times) > 0, True))
 
 
 def read_run(run: RunFiles) -> RunLogs:
@@ -139,7 +135,7 @@ def read_run(run: RunFiles) -> RunLogs:
         own = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
         own = _stamped_by(log.times, own)
         _check_times(run.covariance, own.times)
-        last = _last_of_each(own.times)
+        last = np.append(np.diff(own.times) > 0, True)
         own = own._replace(times=own.times[last], covariances=own.covariances[last])
     elif not len(log.covariances):
         raise ValueError(
@@ -151,22 +147,22 @@ def read_run(run: RunFiles) -> RunLogs:
     oriented, told = _oriented(log._replace(poses=log.poses[there]), truth)
     logs = (log, truth) if own is log else (log, truth, own)
     notes = (*(x for one in logs for x in one.notes), *_other_frames(log, truth), *told)
-    return RunLogs(run, log, truth, own, oriented, notes)
+    P, at, of = _nearest(log.times, own.times, own.covariances)
+    if not len(at):
+        raise _nothing_in_common(run, run.of_covariances, log.times, own.times)
+    P = without_unknown(P[None])[0]
+    if isinstance(run.estimate, ros.Topic) and run.covariance is None:
+        P = _filled_in(run.estimate, P)
+    unused = ~np.isin(np.arange(len(own.times)), of)
+    log = log._replace(covariances=P, said=own.said)
+    return RunLogs(run, log, truth, own.times, unused, oriented, notes)
 
 
 def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
     """The poses of a run at the same times, whose clock is behind the truth's by an offset in
     seconds, or `auto`. Raises ValueError where few poses can be compared.
     """
-    log, own, notes = logs.estimate, logs.covariances, list(logs.notes)
-    P, at, of = _nearest(log.times, own.times, own.covariances)
-    if not len(at):
-        raise _nothing_in_common(logs.files, logs.files.of_covariances, log.times, own.times)
-    P = without_unknown(P[None])[0]
-    if isinstance(logs.files.estimate, ros.Topic) and logs.files.covariance is None:
-        P = _filled_in(logs.files.estimate, P)
-    there = ~np.isnan(log.poses[:, 0, 0])
-    left_out = _counted("poses of the estimate are NaN", ~there)
+    log, files, notes = logs.estimate, logs.files, [*logs.notes]
     if time_offset == "auto":
         found = logs.offset
         time_offset = found.seconds if found is not None and found.found else 0.0
@@ -174,24 +170,28 @@ def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
             f"taken to be {1e3 * time_offset:.1f} ms late, as found" if time_offset else "in time"
         )
         notes.append(f"the estimate is {told}")
-    stamps, P = log.times[there], P[there]
+    there = ~np.isnan(log.poses[:, 0, 0])
+    stamps, P = log.times[there], log.covariances[there]
     times = stamps - float(time_offset)
-    log = log._replace(times=times, poses=log.poses[there])
-    true, estimates, more = _truths(logs, log, P)
+    log = log._replace(times=times, poses=log.poses[there], covariances=P)
+    true, estimates, why = _truths(logs, log)
     if np.isnan(true[:, 0, 0]).all():
-        raise _nothing_in_common(logs.files, logs.files.truth, times, logs.truth.times)
-    left_out |= _counted(f"poses have no covariance {_WITHIN}", np.isnan(P[:, 0, 0]))
-    left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
-    if unused := len(own.times) - len(np.unique(of)):
-        left_out["covariances are at no time of the estimate"] = unused, len(own.times)
-    those = evaluated_poses(logs.files.estimate.parent, stamps, exactly_known(P))
-    for what, others in those.others.items():
-        left_out |= _counted(what, others)
-    if any(others.any() for others in those.others.values()):
-        notes.append(f"map {those.map}, the longest, is evaluated")
-    result = RunLog(logs, times, estimates, P, true, those, left_out, (*notes, *more))
-    _check_share(result, more)
-    return result
+        raise _nothing_in_common(files, files.truth, times, logs.truth.times)
+    _check_share(logs, log, true, why)
+    left_out = {
+        "poses of the estimate are NaN": ~there,
+        f"poses have no covariance {_WITHIN}": np.isnan(P[:, 0, 0]),
+        "poses have no truth": np.isnan(true[:, 0, 0]),
+        "covariances are at no time of the estimate": logs.unused,
+    }
+    number, others = tracked(files.estimate.parent, stamps, exactly_known(P))
+    for out in others.values():
+        true = np.where(out[:, None, None], np.nan, true)
+    if any(out.any() for out in others.values()):
+        notes.append(f"map {number}, the longest, is evaluated")
+    masks = {what: out for what, out in (left_out | others).items() if out.any()}
+    counts = {what: (int(out.sum()), len(out)) for what, out in masks.items()}
+    return RunLog(logs, times, estimates, P, true, number, counts, (*notes, *why))
 
 
 def with_other(read: RunLog, convention: Convention) -> RunLog:
@@ -241,9 +241,7 @@ def _stamped_by(times: Float[np.ndarray, " n"], own: Log) -> Log:
     return own._replace(times=times, notes=(*own.notes, note))
 
 
-def _nearest(
-    times: Float[np.ndarray, " n"], others: Float[np.ndarray, " m"], values: np.ndarray
-) -> tuple[np.ndarray, Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def _nearest(times: Times, others: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
     """The values of other times at ours, NaN where there is none; and which belong together."""
     at, of = associated(times, others)
     result = np.full((len(times), *values.shape[1:]), np.nan)
@@ -252,10 +250,8 @@ def _nearest(
     return result, at, of
 
 
-def _nothing_in_common(
-    run: RunFiles, other: Place, times: np.ndarray, others: np.ndarray
-) -> ValueError:
-    spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, others))
+def _nothing_in_common(run: RunFiles, other: Place, *times: np.ndarray) -> ValueError:
+    spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in times)
     return ValueError(
         f"{run.estimate} and {other} have no time stamps in common {_WITHIN}: {spans}"
     )
@@ -274,10 +270,6 @@ def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndar
             f"{topic}: has no covariances, all {len(P)} are NaN or zero; a verdict needs them"
         )
     return np.where(without[:, None, None], np.nan, P)
-
-
-def _counted(what: str, missing: Bool[np.ndarray, " n"]) -> dict[str, tuple[int, int]]:
-    return {what: (int(missing.sum()), len(missing))} if missing.any() else {}
 
 
 def _other_frames(log: Log, truth: Log) -> list[str]:
@@ -306,7 +298,7 @@ def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
     return True, []
 
 
-def _truths(logs: RunLogs, log: Log, P: Squares) -> tuple[Matrices, Matrices, list[str]]:
+def _truths(logs: RunLogs, log: Log) -> tuple[Matrices, Matrices, list[str]]:
     """The true poses of every estimate, NaN where there is none, the estimates, and remarks.
 
     Raises ValueError where there is none.
@@ -319,7 +311,7 @@ def _truths(logs: RunLogs, log: Log, P: Squares) -> tuple[Matrices, Matrices, li
     gap, step = (np.median(np.diff(x)) if len(x) > 1 else 0.0 for x in (times, log.times))
     off = np.abs(log.times[at] - times[of]).max() if len(at) else np.inf
     wrong = _interpolation_error(times, poses)
-    sigma = _sigmas(log, P, Convention(**logs.covariances.said))
+    sigma = _sigmas(log)
     most = (wrong / sigma)[: 2 if oriented else 1].max()
     elsewhere, dense = off > 1e-6 * max(gap, step), gap <= SPARSE * step
     if elsewhere and dense and most <= DENSE:
@@ -370,8 +362,9 @@ def _interpolation_error(times: Times, poses: Matrices) -> Float[np.ndarray, " 2
     return np.array([np.median(off), np.median(turned)]) / 4
 
 
-def _sigmas(log: Log, P: Float[np.ndarray, "n t t"], convention: Convention) -> np.ndarray:
+def _sigmas(log: Log) -> Float[np.ndarray, " 2"]:
     """The median of the least σ of position and of rotation."""
+    P, convention = log.covariances, Convention(**log.said)
     there = ~np.isnan(P).any(axis=(1, 2)) & np.any(P, axis=(1, 2))
     if not there.any():
         return np.full(2, np.nan)
@@ -383,9 +376,7 @@ def _sigmas(log: Log, P: Float[np.ndarray, "n t t"], convention: Convention) -> 
     return np.maximum(least, 1e-12)
 
 
-def _at_stamps_of_truth(
-    log: Log, times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m d d"]
-) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"]]:
+def _at_stamps_of_truth(log: Log, times: Times, poses: np.ndarray) -> tuple[Matrices, Matrices]:
     """The estimates nearest to true poses, interpolated to their stamps, and those truths."""
     between = (times >= log.times[0]) & (times <= log.times[-1])
     times, poses = times[between], poses[between]
@@ -397,24 +388,24 @@ def _at_stamps_of_truth(
     return moved, true
 
 
-def _check_share(read: RunLog, why: list[str]) -> None:
+def _check_share(logs: RunLogs, log: Log, true: Matrices, why: list[str]) -> None:
     """Raise ValueError where most of a run would not be compared, and say why."""
-    logs = read.logs
+    own = log.times
     others = (
-        (logs.files.of_covariances, logs.covariances.times, ~np.isnan(read.covariances[:, 0, 0])),
-        (logs.files.truth, logs.truth.times, ~np.isnan(read.truths[:, 0, 0])),
+        (logs.files.of_covariances, logs.covariance_times, ~np.isnan(log.covariances[:, 0, 0])),
+        (logs.files.truth, logs.truth.times, ~np.isnan(true[:, 0, 0])),
     )
     there: Bool[np.ndarray, " n"] = others[0][2] & others[1][2]
-    fewest = min(len(read.times), *(len(times) for _, times, _ in others))
+    fewest = min(len(own), *(len(times) for _, times, _ in others))
     enough = np.sum(there) >= LEAST_SHARE * fewest
-    if enough and _span(read.times[there]) >= LEAST_SHARE * _span(read.times):
+    if enough and np.ptp(own[there]) >= LEAST_SHARE * np.ptp(own):
         return
     path, times, _ = min(others, key=lambda other: int(np.sum(other[2])))
-    after = np.searchsorted(times, read.times)
+    after = np.searchsorted(times, own)
     beside = times[np.clip([after - 1, after], 0, len(times) - 1)]
-    away = float(np.median(np.abs(beside - read.times).min(axis=0)))
+    away = float(np.median(np.abs(beside - own).min(axis=0)))
     raise ValueError(
-        f"{logs.files.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
+        f"{logs.files.estimate}: of its {_held(own)} only {np.sum(there)} can be compared: "
         f"{np.sum(others[0][2])} have a covariance {_WITHIN}, and "
         f"{np.sum(others[1][2])} a truth. {path} has {_held(times)}; the nearest one "
         f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
@@ -426,5 +417,37 @@ def _held(times: Float[np.ndarray, " n"]) -> str:
     return f"{len(times)} times from {times[0]:.3f} to {times[-1]:.3f} s"
 
 
-def _span(times: Float[np.ndarray, " n"]) -> float:
-    return float(times[-1] - times[0]) if len(times) else 0.0
+def tracked(
+    folder: Path, times: Times, known: Bool[np.ndarray, " n"]
+) -> tuple[int, dict[str, Bool[np.ndarray, " n"]]]:
+    """The map of the poses at these times that the tracker's file in the folder leaves to be
+    evaluated, and masks of the others, by why they are not.
+
+    They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
+    that is `known` exactly stays: it is where the map begins, and has a place in any unit. All
+    poses where there is no such file. Raises ValueError where it is of other times, or nothing is
+    left.
+    """
+    path = folder / "frames.csv"
+    frames = read_frames(path)
+    if frames is None:
+        return 0, {}
+    order = np.argsort(frames[0], kind="stable")
+    place = np.interp(times, frames[0][order], np.arange(len(order)))
+    at, lost, maps, fixed = (x[order[np.rint(place).astype(int)]] for x in frames)
+    away = np.abs(at - times)
+    if away.max() > MAX_TIME_DIFFERENCE:
+        raise ValueError(
+            f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
+            f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
+        )
+    usable = fixed & ~lost
+    if not usable.any():
+        raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
+    number = int(np.argmax(np.bincount(maps[usable])))
+    own = maps == number
+    return number, {
+        "poses are of other maps, each with its own unit": ~own,
+        "poses are of frames that are lost": own & lost,
+        "poses are from before the unit of their map was fixed": own & ~lost & ~fixed & ~known,
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from jaxslam._runtime import plotted
 from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.evaluation.alignment import INDEPENDENT
-from jaxslam.evaluation.convention import Convention, Values
+from jaxslam.evaluation.convention import Convention, Squares
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
     at,
@@ -76,6 +76,8 @@ class Evaluation:
     """The error of every run, step and axis; NaN where nothing was logged."""
     sigmas: PerAxis
     """The σ that the filter claims of every error."""
+    covariances: Float[np.ndarray, "runs steps n n"]
+    """The covariances of the errors; identities where nothing was logged."""
     whitened: PerAxis
     """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
     times: Float[np.ndarray, " steps"]
@@ -92,10 +94,6 @@ class Evaluation:
     """The convention that would make the data consistent, where it was searched for."""
     notes: tuple[str, ...] = ()
     """Remarks on what was left out, and what was assumed."""
-    fitted: float = 0.0
-    """The most degrees of freedom that a fit of the scale of a run took from every NEES."""
-    axis_fitted: tuple[float, ...] = ()
-    """The same of every axis alone; empty where nothing was fitted."""
     scale: Scale | None = None
     """The scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
     truth_sigma: tuple[float, float] | None = None
@@ -117,6 +115,11 @@ class Evaluation:
         """The number of steps of the longest run."""
         return self.nees.shape[1]
 
+    @property
+    def fitted(self) -> float:
+        """The most degrees of freedom that a fit of the scale of a run took from every NEES."""
+        return 0.0 if self.scale is None else self.scale.fitted
+
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict on one study over all steps, see `jaxslam.statistics.Tally.verdict`.
@@ -135,7 +138,12 @@ class Evaluation:
     def _of_nees(self) -> Verdict:
         with np.errstate(over="ignore"):
             z = self.errors / self.sigmas
-            return _as_assumed(self._verdict(z, self.whitened, self.dof, self.fitted), self.notes)
+            found = self._verdict(z, self.whitened, self.dof, self.fitted)
+        # σ may seem wrong because errors of different poses are taken as independent.
+        wrong = found["word"] in ("over-confident", "under-confident")
+        as_assumed = 1 / ASSUMED < (found["sigma_factor"] or 0.0) < ASSUMED
+        doubted = INDEPENDENT in self.notes and wrong and as_assumed
+        return found | {"word": "cannot tell"} if doubted else found
 
     def _verdict(self, normalised: PerAxis, whitened: PerAxis, dof: int, fitted: float) -> Verdict:
         """The verdict on whitened errors, which are over their σ `normalised`."""
@@ -267,7 +275,7 @@ class Evaluation:
     def _axis_verdicts(self) -> list[Verdict]:
         with np.errstate(over="ignore"):
             normalised = np.split(self.errors / self.sigmas, len(self.names), axis=-1)
-            fitted = self.axis_fitted or (0.0,) * len(self.names)
+            fitted = (0.0,) * len(normalised) if self.scale is None else self.scale.axis_fitted
             return [self._verdict(z, z, 1, f) for z, f in zip(normalised, fitted, strict=True)]
 
     def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
@@ -276,37 +284,7 @@ class Evaluation:
 
     def asdict(self) -> dict[str, Json]:
         """The content of `evaluation.json`."""
-        from jaxslam._version import __version__
-
-        return {
-            "schema": 1,
-            "version": __version__,
-            "quantity": self.quantity,
-            "runs": self.runs,
-            "steps": self.steps,
-            "dof": self.dof,
-            "time": json_numbers(self.times),
-            "band95": list(self.band95),
-            "nees": json_numbers(self.mean),
-            "runs_of_step": self.runs_of_step.tolist(),
-            "band95_of_step": self.band95_of_step.tolist(),
-            "inside": self.inside,
-            "verdict": self.verdict,
-            "run_names": list(self.run_names),
-            "lost_runs": self.lost_runs,
-            **_by_axis(self),
-            "coverage": self.coverage,
-            **_beside_nees(self),
-            "convention": None if self.convention is None else asdict(self.convention),
-            "alignment": self.alignment,
-            "truth_sigma": None if self.truth_sigma is None else list(self.truth_sigma),
-            "fitted": self.fitted,
-            "scale": None if self.scale is None else self.scale.asdict(),
-            "suggested": None if self.suggested is None else asdict(self.suggested),
-            "identified": None if self.identified is None else self.identified.asdict(),
-            "mistakes": [mistake.told for mistake in self.mistakes],
-            "notes": self.remarks,
-        }
+        return _as_json(self)
 
     to_dict = asdict
 
@@ -351,22 +329,74 @@ class Evaluation:
 
 def _told(evaluation: Evaluation) -> str:
     """The verdict in lines, or the mistakes of the log in its place."""
+    if evaluation.mistakes:
+        return "\n".join([evaluation.headline, *(x.told for x in evaluation.mistakes)])
     # Lost runs are named below, by their names here.
     more = sentences(evaluation._of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
-    told = [evaluation.headline, *more]
+    told, lost = [evaluation.headline, *more], evaluation.lost_runs
     if evaluation.scale is not None and not evaluation.scale.disproved:
         told.append(evaluation.scale.sentence)
     told += _beyond_nees(evaluation)
-    doubt = [] if evaluation.identified is None else [evaluation.identified.sentence]
-    if evaluation.lost_runs:
-        more = len(evaluation.lost_runs) - _LISTED
-        which = ", ".join(evaluation.lost_runs[:_LISTED]) + (
-            f" and {more} more" if more > 0 else ""
-        )
-        told.append(f"{'lost' if evaluation.quantity == 'NEES' else 'outlying'}: {which}")
-    if evaluation.mistakes:
-        told, doubt = [evaluation.headline, *(mistake.told for mistake in evaluation.mistakes)], []
-    return "\n".join([*told, *doubt])
+    if lost:
+        others = f" and {len(lost) - _LISTED} more" if len(lost) > _LISTED else ""
+        what = "lost" if evaluation.quantity == "NEES" else "outlying"
+        told.append(f"{what}: {', '.join(lost[:_LISTED])}{others}")
+    if evaluation.identified is not None:
+        told.append(evaluation.identified.sentence)
+    return "\n".join(told)
+
+
+def _as_json(evaluation: Evaluation) -> dict[str, Json]:
+    from jaxslam._version import __version__
+
+    names, bias, found = [*enumerate(evaluation.names)], evaluation.bias, evaluation.correlation
+    outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
+    return {
+        "schema": 1,
+        "version": __version__,
+        "quantity": evaluation.quantity,
+        "runs": evaluation.runs,
+        "steps": evaluation.steps,
+        "dof": evaluation.dof,
+        "time": json_numbers(evaluation.times),
+        "band95": list(evaluation.band95),
+        "nees": json_numbers(evaluation.mean),
+        "runs_of_step": evaluation.runs_of_step.tolist(),
+        "band95_of_step": evaluation.band95_of_step.tolist(),
+        "inside": evaluation.inside,
+        "verdict": evaluation.verdict,
+        "run_names": list(evaluation.run_names),
+        "lost_runs": evaluation.lost_runs,
+        "outside3sigma": {name: float(outside[i]) for i, name in names},
+        "rmse": {name: json_numbers(rmse[:, i]) for i, name in names},
+        "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
+        "axis_verdict": {name: evaluation.axis_verdict(i) for i, name in names},
+        "coverage": evaluation.coverage,
+        "effective_samples": evaluation._of_nees.get("effective"),
+        "time_offset": evaluation.time_offset
+        and dict(zip(("seconds", "sigma"), evaluation.time_offset, strict=True)),
+        "causes": [
+            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
+            for x in evaluation.mistakes
+        ],
+        "bias": bias
+        and {x: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, x in names},
+        "correlation": found
+        and {
+            "matrix": found.matrix.tolist(),
+            "axes": [evaluation.names[i] for i in found.axes],
+            "p": found.p,
+        },
+        "convention": evaluation.convention and asdict(evaluation.convention),
+        "alignment": evaluation.alignment,
+        "truth_sigma": evaluation.truth_sigma and list(evaluation.truth_sigma),
+        "fitted": evaluation.fitted,
+        "scale": evaluation.scale and evaluation.scale.asdict(),
+        "suggested": evaluation.suggested and asdict(evaluation.suggested),
+        "identified": evaluation.identified and evaluation.identified.asdict(),
+        "mistakes": [mistake.told for mistake in evaluation.mistakes],
+        "notes": evaluation.remarks,
+    }
 
 
 def described(found: Evaluation, **words: Any) -> Evaluation:
@@ -376,38 +406,6 @@ def described(found: Evaluation, **words: Any) -> Evaluation:
         if name in found.__dict__:
             result.__dict__[name] = found.__dict__[name]
     return result
-
-
-def _beside_nees(evaluation: Evaluation) -> dict[str, Json]:
-    """What is said beside NEES, as JSON has it."""
-    names, bias, found = evaluation.names, evaluation.bias, evaluation.correlation
-    offset = evaluation.time_offset
-    return {
-        "effective_samples": evaluation._of_nees.get("effective"),
-        "time_offset": None if offset is None else {"seconds": offset[0], "sigma": offset[1]},
-        "causes": [
-            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
-            for x in evaluation.mistakes
-        ],
-        "bias": bias
-        and {n: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, n in enumerate(names)},
-        "correlation": found
-        and {
-            "matrix": found.matrix.tolist(),
-            "axes": [names[i] for i in found.axes],
-            "p": found.p,
-        },
-    }
-
-
-def _as_assumed(found: Verdict, notes: Sequence[str]) -> Verdict:
-    """No verdict on a σ that may seem wrong because errors of different poses are taken as
-    independent, for the gauge of all positions."""
-    factor = found["sigma_factor"]
-    wrong = found["word"] in ("over-confident", "under-confident") and factor is not None
-    if INDEPENDENT in notes and wrong and 1 / ASSUMED < factor < ASSUMED:
-        return found | {"word": "cannot tell"}
-    return found
 
 
 def _html(evaluation: Evaluation, told: str) -> str:
@@ -433,45 +431,31 @@ def latex(evaluation: Evaluation) -> str:
     return "\n".join([*comments, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _by_axis(evaluation: Evaluation) -> dict[str, Json]:
-    places = {name: i for i, name in enumerate(evaluation.names)}
-    outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
-    return {
-        "outside3sigma": {name: float(outside[i]) for name, i in places.items()},
-        "rmse": {name: json_numbers(rmse[:, i]) for name, i in places.items()},
-        "sigma": {name: json_numbers(sigma[:, i]) for name, i in places.items()},
-        "axis_verdict": {name: evaluation.axis_verdict(i) for name, i in places.items()},
-    }
-
-
 def _covered(evaluation: Evaluation) -> str:
     shares = [f"{share:.1%}" for share in evaluation.coverage.values()]
     what = "errors" if evaluation.quantity == "NEES" else "innovations"
     return f"sets of 50, 90 and 99 % hold {shares[0]}, {shares[1]} and {shares[2]} of the {what}"
 
 
-def _beyond_nees(evaluation: Evaluation) -> list[str]:
+def _beyond_nees(evaluation: Evaluation) -> Iterator[str]:
     """A sentence on a mean error, and one on a correlation, where they are more than chance.
 
     Either is said of a right filter in one study of 200.
     """
-    names, bias, found, told = evaluation.names, evaluation.bias, evaluation.correlation, []
-    level = (1 - VERDICT_CONFIDENCE) / 2
-    if bias is not None and len(names) * np.min(bias.p) < level:
+    names, bias, found = evaluation.names, evaluation.bias, evaluation.correlation
+
+    def beyond_chance(p: float) -> str:
+        if p >= (1 - VERDICT_CONFIDENCE) / 2:
+            return ""
+        return f", more than chance ({f'p = {p:.2g}' if p >= 1e-4 else 'p < 0.0001'})"
+
+    if bias is not None and (chance := beyond_chance(len(names) * np.min(bias.p))):
         axis = int(np.lexsort((-np.abs(bias.mean), bias.p))[0])
-        what = f"the mean error of {names[axis]} is {bias.mean[axis]:.2f} σ"
-        told.append(f"{what}, more than chance ({_p(len(names) * bias.p[axis])})")
-    if found is not None and found.p < level:
+        yield f"the mean error of {names[axis]} is {bias.mean[axis]:.2f} σ{chance}"
+    if found is not None and (chance := beyond_chance(found.p)):
         first, second = (names[i] for i in found.axes)
-        what = (
-            f"whitened errors of {first} and {second} correlate by {found.matrix[found.axes]:.2f}"
-        )
-        told.append(f"{what}, more than chance ({_p(found.p)})")
-    return told
-
-
-def _p(p: float) -> str:
-    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+        by = f"{found.matrix[found.axes]:.2f}"
+        yield f"whitened errors of {first} and {second} correlate by {by}{chance}"
 
 
 def _counted(evaluation: Evaluation) -> str:
@@ -506,26 +490,21 @@ def _run(evaluation: Evaluation, run: int) -> str:
 
 
 def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """The cells of the table: titles, a row of each axis, and what they are of a right filter."""
     errors = "RMSE, m or rad" if evaluation.convention and not evaluation.scale else "RMSE"
-    return [
-        ("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
-        *(_row(evaluation, i) for i in range(len(evaluation.names))),
-        ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
-    ]
-
-
-def _row(evaluation: Evaluation, axis: int) -> tuple[str, ...]:
-    found = evaluation.axis_verdict(axis)
-    there = evaluation.logged.any(axis=0)
-    rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (evaluation.rmse, evaluation.sigma))
-    factor, low, high = (
-        "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
-        for x in (found["sigma_factor"], *found["interval99"])
-    )
-    if (found["interval99"][1] or 0) > MOST:
-        high = f"> {MOST:g}"
-    outside = f"{evaluation.outside3sigma[axis]:.2%}"
-    return evaluation.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
+    rows = [("axis", errors, "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ")]
+    there, outside = evaluation.logged.any(axis=0), evaluation.outside3sigma
+    for axis, name in enumerate(evaluation.names):
+        found = evaluation.axis_verdict(axis)
+        rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (evaluation.rmse, evaluation.sigma))
+        factor, low, high = (
+            "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
+            for x in (found["sigma_factor"], *found["interval99"])
+        )
+        if (found["interval99"][1] or 0) > MOST:
+            high = f"> {MOST:g}"
+        rows.append((name, rmse, sigma, factor, f"[{low}, {high}]", f"{outside[axis]:.2%}"))
+    return [*rows, ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}")]
 
 
 def _in_columns(*rows: tuple[str, ...]) -> list[str]:
@@ -578,7 +557,7 @@ def evaluate(
     )
 
 
-def of_steps(errors: PerAxis, P: Values, logged: Mask, **words: Any) -> Evaluation:
+def of_steps(errors: PerAxis, P: Squares, logged: Mask, **words: Any) -> Evaluation:
     """The evaluation of errors and their covariances at the steps that were logged."""
     z = whitened(errors, P)
     return Evaluation(
@@ -587,6 +566,7 @@ def of_steps(errors: PerAxis, P: Values, logged: Mask, **words: Any) -> Evaluati
         whitened=filled(z, logged, np.nan),
         errors=filled(errors, logged, np.nan),
         sigmas=filled(sigmas(P), logged, np.nan),
+        covariances=P,
         **words,
     )
 
@@ -613,9 +593,8 @@ def evaluate_nees(
             f"{values.shape}"
         )
     check_every_run(~np.isnan(values))
-    if (values < 0).any():
-        run, step = np.argwhere(values < 0)[0]
-        raise ValueError(f"{quantity} of {at((run, step))} is {values[run, step]:.3g}; 0 or more")
+    for place in np.argwhere(values < 0)[:1]:
+        raise ValueError(f"{quantity} of {at(place)} is {values[tuple(place)]:.3g}; 0 or more")
     none = np.empty((*values.shape, 0))
     values, one, notes = of_one_dof(values, each)
     return Evaluation(
@@ -624,6 +603,7 @@ def evaluate_nees(
         nees=values,
         errors=none,
         sigmas=none,
+        covariances=np.empty((*values.shape, 0, 0)),
         times=step_times(times, values.shape[1]),
         timed=times is not None,
         names=(),
@@ -638,7 +618,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
 
-def _mean(values: Values, there: Mask) -> Float[np.ndarray, "steps ..."]:
+def _mean(values: np.ndarray, there: Mask) -> Float[np.ndarray, "steps ..."]:
     """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
     total = np.sum(filled(values, there, 0.0), axis=0)

@@ -76,8 +76,11 @@ class Logged(NamedTuple):
 
 
 def mistakes(logged: Logged) -> tuple[Mistake, ...]:
-    """Return all mistakes that are found."""
-    kinds = [_is_angle(name) for name in logged.names]
+    """Return all mistakes that are found, of axes that by their names are angles, or may be."""
+    kinds = [
+        True if _ANGLES.fullmatch(name) else False if _LENGTHS.fullmatch(name) else None
+        for name in logged.names
+    ]
     return (*_unwrapped(logged, kinds), *_degrees(logged, kinds), *_interchanged(logged))
 
 
@@ -114,11 +117,6 @@ def withheld(found: Verdict) -> Verdict:
 
     parts = Verdict({key: silent(x) for key, x in found.items()})
     return parts | {"word": "cannot tell"} if "word" in found else parts
-
-
-def _is_angle(name: str) -> bool | None:
-    """Whether the name of an axis is that of an angle; None where that is not clear."""
-    return True if _ANGLES.fullmatch(name) else False if _LENGTHS.fullmatch(name) else None
 
 
 def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:

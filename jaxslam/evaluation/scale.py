@@ -11,24 +11,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
-from jaxslam.evaluation.alignment import carried
 from jaxslam.evaluation.convention import (
-    Axes,
     Convention,
     Joints,
     Matrices,
     Squares,
     Tangents,
-    pose_errors,
+    converted,
 )
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
-from jaxslam.statistics.bands import Mask, PerStep
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
@@ -49,7 +46,10 @@ class Scale:
     nees: PerStep
     """The NEES of the drift; NaN where a pose determines no scale."""
     fitted: float
-    """The most degrees of freedom that the fit of the run's scale took from every drift."""
+    """The most degrees of freedom that the fit of the run's scale took from every drift, and from
+    the NEES of every pose."""
+    axis_fitted: tuple[float, ...] = ()
+    """The same of every axis alone."""
 
     @property
     def told(self) -> Mask:
@@ -116,47 +116,34 @@ class Scale:
     def asdict(self) -> dict[str, Json]:
         """Return the content for `evaluation.json`."""
         (low, high), median, sigma = self.over_runs
+        rms, in_sigma = json_numbers(np.array([self.rms, self.factor]))
         return {
             "log_scale": json_numbers(self.log_scale),
             "drift": json_numbers(median),
             "drift95": [json_numbers(low), json_numbers(high)],
             "sigma": json_numbers(sigma),
-            "drift_rms": json_numbers(np.array([self.rms]))[0],
-            "drift_in_sigma": json_numbers(np.array([self.factor]))[0],
+            "drift_rms": rms,
+            "drift_in_sigma": in_sigma,
             "fitted": self.fitted,
             "verdict": self.verdict,
             "disproved": self.disproved,
         }
 
 
-class AtScale(NamedTuple):
-    """The errors of runs at one scale each."""
-
-    errors: Float[np.ndarray, "runs steps m"]
-    covariances: Float[np.ndarray, "runs steps m m"]
-    """The covariances of these errors: without the part that a fit to a joint covariance takes."""
-    fitted: float
-    """The most degrees of freedom that the fit took from the NEES of a pose."""
-    axis_fitted: Float[np.ndarray, " m"]
-    """The same of every axis alone."""
-    scale: Scale
-
-
-def at_one_scale(poses: Poses, axes: Axes) -> AtScale:
-    """Return errors along some axes at the true scale that explains all poses of a run best."""
+def at_one_scale(poses: Poses) -> tuple[PerAxis, Squares, Scale]:
+    """The errors at the true scale that explains all poses of a run best, their covariances, and
+    that scale. A fit to a joint covariance takes its part out of them."""
     if poses.joint is not None:
-        return _jointly(poses, poses.joint, axes)
-    P = poses.covariances[..., axes[:, None], axes]
-    errors, slope = (x[..., axes] for x in _affine(poses.convention, poses.estimates, poses.truths))
+        return _jointly(poses, poses.joint)
+    P, (errors, slope) = poses.along_axes(), _affine(poses)
     own = _own_scales(errors, slope, P)
     found = one_scale(*own, poses.logged)
     s = np.exp(np.where(np.isfinite(found.log_scale), found.log_scale, 0.0))
-    sigma = own.sigma
-    known = np.where(np.isfinite(sigma), np.exp(own.log_scale) * sigma, 0.0)
+    known = np.where(np.isfinite(own.sigma), np.exp(own.log_scale) * own.sigma, 0.0)
     share = (known[..., None] * slope) ** 2 / np.diagonal(P, axis1=-2, axis2=-1)
-    fitted = np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0)
-    scale = Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0)
-    return AtScale(errors + slope * (s - 1)[:, None, None], P, 1.0, fitted, scale)
+    fitted = np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0).tolist()
+    scale = Scale(found.log_scale, found.drift, own.sigma, found.normalised, 1.0, tuple(fitted))
+    return errors + slope * (s - 1)[:, None, None], P, scale
 
 
 def errors_beyond_scale(
@@ -166,18 +153,17 @@ def errors_beyond_scale(
 
     The covariances are in the convention.
     """
-    e, g = _affine(convention, estimates, truths)
-    return _own_scales(e, g, covariances)
+    logged = np.ones(estimates.shape[:-2], bool)
+    poses = Poses(estimates, covariances, truths, logged, convention)
+    return _own_scales(*_affine(poses), covariances)
 
 
-def _affine(
-    convention: Convention, estimates: Matrices, truths: Matrices
-) -> tuple[Tangents, Tangents]:
+def _affine(poses: Poses) -> tuple[Tangents, Tangents]:
     """Return e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
-    twice = truths.copy()
+    twice = poses.truths.copy()
     twice[..., :-1, -1] *= 2.0
-    once = pose_errors(convention, estimates, truths)
-    return once, pose_errors(convention, estimates, twice) - once
+    once = poses.errors()
+    return once, poses._replace(truths=twice).errors() - once
 
 
 def _own_scales(errors: Tangents, slope: Tangents, covariances: Squares) -> BeyondScale:
@@ -193,18 +179,16 @@ def _own_scales(errors: Tangents, slope: Tangents, covariances: Squares) -> Beyo
         return BeyondScale(nees, np.log(s), 1 / (s * np.sqrt(curvature)))
 
 
-def _jointly(poses: Poses, joints: Joints, axes: Axes) -> AtScale:
+def _jointly(poses: Poses, joints: Joints) -> tuple[PerAxis, Squares, Scale]:
     """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
     """
-    e, G = (x[..., axes] for x in _affine(poses.convention, poses.estimates, poses.truths))
-    t, m = poses.covariances.shape[-1], len(axes)
-    left = poses.covariances[..., axes[:, None], axes].copy()
-    own, (drift, sigma, nees) = left.copy(), (np.full(e.shape[:2], np.nan) for _ in range(3))
+    (e, G), own, t = _affine(poses), poses.along_axes(), poses.covariances.shape[-1]
+    left, (drift, sigma, nees) = own.copy(), (np.full(e.shape[:2], np.nan) for _ in range(3))
     log_scale = np.full(len(e), np.nan)
     for run, logged in enumerate(poses.logged):
-        rows = (np.flatnonzero(logged)[:, None] * t + axes).ravel()
+        rows = (np.flatnonzero(logged)[:, None] * t + poses.axes).ravel()
         joint = joints[run][np.ix_(rows, rows)]
         s, information = _fitted(joint, e[run, logged].ravel(), G[run, logged].ravel(), run)
         if information <= 0 or s <= 0:
@@ -221,15 +205,10 @@ def _jointly(poses: Poses, joints: Joints, axes: Axes) -> AtScale:
     variance = np.einsum("ki,kij,kj->k", h, left[told], h)
     s = np.exp(np.broadcast_to(log_scale[:, None], told.shape)[told])
     drift[told], sigma[told], nees[told] = -away / s, np.sqrt(variance) / s, away**2 / variance
-    return AtScale(e, left, 0.0, np.zeros(m), Scale(log_scale, drift, sigma, nees, 0.0))
+    return e, left, Scale(log_scale, drift, sigma, nees, 0.0, (0.0,) * e.shape[-1])
 
 
-def _fitted(
-    joint: Float[np.ndarray, "k k"],
-    e: Float[np.ndarray, " k"],
-    G: Float[np.ndarray, " k"],
-    run: int,
-) -> tuple[float, float]:
+def _fitted(joint: Squares, e: Tangents, G: Tangents, run: int) -> tuple[float, float]:
     """The ŝ of a run, and the information of all its poses on it, Gᵀ Σ⁻¹ G. Raises ValueError."""
     scaling = 1 / np.sqrt(np.maximum(np.diagonal(joint), np.finfo(float).tiny))
     try:
@@ -244,17 +223,18 @@ def _fitted(
     return (1 - float(slope @ residual) / information if information else 1.0), information
 
 
-def of_aligned(poses: Poses, axes: Axes, log_scale: Float[np.ndarray, " runs"]) -> Scale:
+def of_aligned(poses: Poses, log_scale: Float[np.ndarray, " runs"]) -> Scale:
     """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
-    T, truth = poses.estimates.copy(), poses.truths.copy()
+    T, truth, split = poses.estimates.copy(), poses.truths.copy(), Convention("split")
     there = poses.logged[..., None, None]
     middle = np.mean(truth, axis=1, where=there, keepdims=True)[..., :-1, -1]
     for x in (T, truth):
         x[..., :-1, -1] -= middle
-    moved = carried(poses, Convention("split"))._replace(estimates=T, truths=truth, joint=None)
-    P = carried(moved, poses.convention).covariances
-    e, g = (x[..., axes] for x in _affine(poses.convention, T, truth))
-    _, own_scale, sigma = _own_scales(e, g, P[..., axes[:, None], axes])
+    P = converted(poses.covariances, poses.estimates, poses.convention, split)
+    P = converted(P, T, split, poses.convention)
+    moved = poses._replace(estimates=T, truths=truth, covariances=P)
+    _, own_scale, sigma = _own_scales(*_affine(moved), moved.along_axes())
     told = poses.logged & np.isfinite(sigma)
     drift, sigma = np.where(told, own_scale, np.nan), np.where(told, sigma, 1.0)
-    return Scale(log_scale, drift, sigma, (drift / sigma) ** 2, 0.0)
+    none = (0.0,) * len(poses.axes)
+    return Scale(log_scale, drift, sigma, (drift / sigma) ** 2, 0.0, none)

@@ -20,13 +20,13 @@ TURNS = Rotation.from_euler("ZYX", np.outer(np.sin(TIMES), [0.5, 0.2, 0.1]))
 PLACES = np.outer(np.arange(STEPS), [0.1, 0.02, 0.0])
 
 
-def log(path, seed, factor=1.0):
+def log(path, seed, factor=1.0, late=0.0):
     """Poses whose errors are independent, and so many times as large as their covariances say."""
     e = factor * SIGMA * np.random.default_rng(seed).normal(size=(STEPS, 6))
     block = np.array([1, 0, 0, 1, 0, 1])
     P = np.tile([*(SIGMA[0] ** 2 * block), *(SIGMA[3] ** 2 * block)], (STEPS, 1))
     q = (TURNS * Rotation.from_rotvec(e[:, 3:])).as_quat()
-    lines(path, TIMES, PLACES + e[:, :3], q, P, header=TITLES + "\n", between=",")
+    lines(path, TIMES + late, PLACES + e[:, :3], q, P, header=TITLES + "\n", between=",")
     return path
 
 
@@ -43,6 +43,16 @@ def test_two_logs_of_one_run_are_compared_without_a_truth(tmp_path):
     lines(tmp_path / "c.txt", TIMES, PLACES, TURNS.as_quat())
     with pytest.raises(ValueError, match=r"c\.txt has no covariances; --against needs"):
         evaluate_log(first, against=tmp_path / "c.txt")
+
+
+def test_without_an_offset_of_their_clocks_both_covariances_count_still(tmp_path):
+    """Of errors that are a fifth of σ, so that rotations tell the offset."""
+    found = evaluate_log(
+        log(tmp_path / "a.csv", 0, 0.2, late=0.2), against=log(tmp_path / "b.csv", 1, 0.2)
+    )
+    (cause,) = found.causes
+    assert cause.what == "the clocks of estimate and truth differ"
+    assert cause.nees == pytest.approx(6 * 0.2**2, rel=0.2)
 
 
 def test_the_file_and_the_table_for_latex(tmp_path, capsys):

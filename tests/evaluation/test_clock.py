@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.evaluation.clock import clock_offset
+from jaxslam.io.logs.log import Log
 from jaxslam.io.tum import of_xytheta
 
 
@@ -28,7 +29,8 @@ def run(offset, seed, sigma=0.005, seconds=20.0, drift=0.0, mounting=None, flat=
         angle = angles[2] + 0.3 * true_times
         T = of_xytheta(np.column_stack([T[:, :2, 3], angle]))
         own = of_xytheta(np.column_stack([T[::10, :2, 2], angle[::10] + noise[:, 0]]))
-    return true_times[::10] + offset, own, true_times, T
+    none = np.empty((0, 6, 6))
+    return Log(true_times[::10] + offset, own, none), Log(true_times, T, none)
 
 
 BODY = np.eye(4)
@@ -64,12 +66,13 @@ def test_clocks_that_agree_have_no_offset():
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda times, own, true_times, true: (times, own[:1].repeat(len(own), 0), true_times, true),
-        lambda times, own, true_times, true: (times[:10], own[:10], true_times, true),
-        lambda times, own, true_times, true: (times + 60.0, own, true_times, true),
+        lambda own: own._replace(poses=own.poses[:1].repeat(len(own.times), 0)),
+        lambda own: own._replace(times=own.times[:10], poses=own.poses[:10]),
+        lambda own: own._replace(times=own.times + 60.0),
     ],
     ids=["no rotation", "few poses", "another hour"],
 )
 def test_where_rotations_do_not_tell_it_there_is_none(spoil):
-    found = clock_offset(*spoil(*run(0.03, 0)))
+    own, true = run(0.03, 0)
+    found = clock_offset(spoil(own), true)
     assert found is None or not found.found

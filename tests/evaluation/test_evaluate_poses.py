@@ -32,6 +32,7 @@ from jaxslam.evaluation.alignment import (
     projected,
     similarity,
 )  # fmt: skip
+from jaxslam.evaluation.comparison import with_truth
 from jaxslam.evaluation.convention import (
     CHOICES,
     alternatives,
@@ -42,8 +43,7 @@ from jaxslam.evaluation.convention import (
     write_covariances,
 )  # fmt: skip
 from jaxslam.evaluation.convention_search import Tried, identify
-from jaxslam.evaluation.inputs import checked_poses
-from jaxslam.evaluation.poses import estimated, with_truth
+from jaxslam.evaluation.inputs import Poses, checked_poses
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
@@ -206,12 +206,13 @@ def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
     found = jaxslam.evaluate_poses(T, P, truth, Convention("split", "body"))
     assert found.suggested == Convention("split", "body", scale="given")
     given = jaxslam.evaluate_poses(T, P, truth, found.suggested)
-    assert given.dof == 6
+    assert (given.dof, given.scale is not None) == (6, True)
+    fits = given.scale.axis_fitted if given.scale else ()
     # The scale of small displacements is not affine, nor are errors exactly Gaussian.
     assert not_disproved(given.verdict)
     assert "NEES is computed at the scale of each run" in str(given)
     for axis in range(6):
-        z, fitted = given.errors[..., [axis]] / given.sigmas[..., [axis]], given.axis_fitted[axis]
+        z, fitted = given.errors[..., [axis]] / given.sigmas[..., [axis]], fits[axis]
         assert given.axis_verdict(axis) == run_verdict(z[..., 0] ** 2, 1, fitted, whitened=z)
 
 
@@ -281,9 +282,9 @@ def test_an_axis_of_small_errors_is_estimated_where_it_is_correlated(correlation
     T, P = T.copy(), P.copy()
     T[..., 2, 3] += 1e-6 * np.random.default_rng(1).normal(size=T.shape[:2])
     P[..., 0, 2] = P[..., 2, 0] = correlation * np.sqrt(P[..., 0, 0] * P[..., 2, 2])
-    used, notes = estimated(checked_poses(T, P, truth, SPLIT), "none")
-    assert ("z" not in used) == left_out
-    assert notes
+    found = jaxslam.evaluate_poses(T, P, truth, SPLIT)
+    assert ("z" not in found.names) == left_out
+    assert "errors are always zero" in str(found)
 
 
 # --- one scale a run ----------------------------------------------------------------------------
@@ -450,7 +451,8 @@ def diagonal(blocks):
 
 def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
     T, P = some(SPATIAL, (5,), 2), np.stack([covariance(6, seed) for seed in range(5)])
-    one, other = (projected(T, x, align="sim3") for x in (P, diagonal(P)))
+    poses = Poses(T, P, T, np.ones(5, bool), SPLIT, align="sim3")
+    one, other = projected(poses), projected(poses._replace(joint=diagonal(P)))
     np.testing.assert_allclose(one, other, atol=1e-12)
     U = gauge_directions(T, "sim3")
     V = U.copy()
@@ -554,7 +556,7 @@ def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
     found = read_covariances(path)
     unit = np.repeat([np.pi / 180, 1.0], 3)
     np.testing.assert_allclose(found.covariances[0], P * unit * unit[:, None], rtol=1e-12)
-    assert found.said == {"order": "rotation-first"}
+    assert found.convention == Convention(order="rotation-first")
     path.write_text(f"0 {upper}\n")
     assert read_covariances(path).convention == Convention()
 
@@ -744,7 +746,7 @@ def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     T, P, truth = logged(Convention(), runs=2, steps=3)
     joint = np.stack([diagonal(one) for one in P])
     poses, firsts = checked_poses(T, joint, truth, Convention()), truth[:, 0]
-    found = with_truth(poses, (0.1, 2.0), np.ones(2), firsts)
+    found = with_truth(poses._replace(truth_sigma=(0.1, 2.0)), np.ones(2), firsts)
     assert found.joint is not None
     blocks = found.joint.reshape(2, 3, 6, 3, 6)
     for k in range(3):

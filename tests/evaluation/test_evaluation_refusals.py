@@ -85,6 +85,7 @@ OF_ARRAYS = [
     ),
     (poses(align="rigid"), "unknown align 'rigid'; known: none, first, yaw, se3, sim3"),
     (poses(*STILL, np.tile(np.eye(4), (40, 6, 1, 1)), align="sim3"), "coincide"),
+    (poses(T[:, :1], POSE_P[:, :1], TRUTH[:, :1], align="sim3"), "coincide"),
 ]
 
 
@@ -157,6 +158,10 @@ ONE, UPPER, DEVIATIONS = np.ones((1, 1, 1)), "1 " * 22, "0 1 1 -0.1 1 1 1"
 NEES = "run,step,nees,dof\n0,0,1,3\n"
 POSES = {"estimates": T, "covariances": POSE_P, "truths": TRUTH}
 OF_FILES = [
+    (
+        csv("step,a,sigma_a\n5,1,1\n6,1,-1\n"),
+        r"a\.csv: sigmas of run 0, step 6 must not be negative, not -1",
+    ),
     (csv("0,0,1,1\n0,1,1\n"), "line 2: expected numbers run, step, n errors"),
     (csv("0,0,1,1,3\n"), "5 columns; expected numbers run, step.*4 for n = 1, 7 for 2, 11 for 3"),
     (csv("0,0,1,1\n0,0,2,1\n"), "line 2: run 0, step 0 appears twice"),

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
 from jaxslam.io.text import Table, rows_of
-from jaxslam.io.tum import transforms
+from jaxslam.io.tum import Times, transforms
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
@@ -81,17 +81,11 @@ def _degrees(parts: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     return np.copysign(np.abs(whole) + minutes / 60 + seconds / 3600, whole)
 
 
-def _log(
-    times: np.ndarray,
-    latitude: np.ndarray,
-    longitude: np.ndarray,
-    height: np.ndarray,
-    P: np.ndarray,
-) -> Log:
-    """Radians, and m above the ellipsoid."""
+def _log(times: Times, north: Times, east: Times, height: Times, P: np.ndarray) -> Log:
+    """Latitudes and longitudes in radians, and m above the ellipsoid."""
     square = FLATTENING * (2 - FLATTENING)
-    radius = EQUATOR / np.sqrt(1 - square * np.sin(latitude) ** 2)
-    (cn, sn), (ce, se) = ((np.cos(x), np.sin(x)) for x in (latitude, longitude))
+    radius = EQUATOR / np.sqrt(1 - square * np.sin(north) ** 2)
+    (cn, sn), (ce, se) = ((np.cos(x), np.sin(x)) for x in (north, east))
     zero = np.zeros_like(sn)
     axes = (-se, ce, zero), (-sn * ce, -sn * se, cn), (cn * ce, cn * se, sn)
     along = (radius + height) * cn

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.io.logs.log import Log, log
+from jaxslam.io.logs.log import Log, log, planar
 from jaxslam.io.text import Table, rows_of
-from jaxslam.io.tum import of_xytheta
 
 _SPATIAL, _PLANAR = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 NOTE = (
@@ -31,8 +30,5 @@ def read(path: Path, lines: Mapping[int, str]) -> Log | None:
     order = np.argsort(values[:, 0], kind="stable")
     values = values[order]
     table = Table(path, (), (), values, tuple(np.array(list(told))[order].tolist()), {})
-    if kind == _PLANAR:
-        T = of_xytheta(values[:, 1:])
-        return Log(values[:, 0], T, np.empty((0, 3, 3)), notes=(NOTE,), stamped=False)
-    found = log(table, values[:, 0], values[:, 1:4], values[:, 4:])
+    found = planar(table, values, "s") if kind == _PLANAR else log(table, values, unit="s")
     return found._replace(notes=(NOTE,), stamped=False)

@@ -23,7 +23,12 @@ _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
 
 
-NOTHING: Mapping[str, str] = MappingProxyType({})
+Words = Mapping[str, str]
+NOTHING: Words = MappingProxyType({})
+Rows = Float[np.ndarray, "n ..."]
+"""Numbers of lines."""
+Stack = Float[np.ndarray, "k d d"]
+"""Poses, one after another."""
 
 
 class Log(NamedTuple):
@@ -35,7 +40,7 @@ class Log(NamedTuple):
     """Matrices (n, 4, 4), or (n, 3, 3) in the plane; NaN where the log has none."""
     covariances: Float[np.ndarray, "m t t"]
     """One for every pose, NaN where the log has none; or none at all."""
-    said: Mapping[str, str] = NOTHING
+    said: Words = NOTHING
     """The words of a `Convention` that the format, or the log, is known by."""
     notes: tuple[str, ...] = ()
     """What was made of the file, where that is a choice."""
@@ -49,30 +54,34 @@ class Log(NamedTuple):
 
 def log(
     table: Table,
-    times: Float[np.ndarray, " n"],
-    positions: Float[np.ndarray, "n 3"],
-    turns: Float[np.ndarray, "n 4"] | None,
-    covariances: Float[np.ndarray, "n 6 6"] | None = None,
+    rows: Rows,
+    P: Rows | None = None,
     said: Mapping[str, str] = NOTHING,
     unit: str = "",
 ) -> Log:
-    """A log of positions and quaternions x, y, z, w, or positions alone. Rows that are all NaN have
-    no pose.
+    """A log of rows `t tx ty tz qx qy qz qw`, or of positions alone, `t tx ty tz`. Rows that are
+    all NaN but for the time have no pose.
 
     Raises ValueError, naming file and line.
     """
-    oriented = turns is not None
-    if turns is None:
-        turns = np.where(np.isnan(positions[:, :1]), np.nan, [0.0, 0.0, 0.0, 1.0])
-    rows = np.column_stack([times, positions, turns])
+    oriented = rows.shape[1] == 8
+    if not oriented:
+        turns = np.where(np.isnan(rows[:, 1:2]), np.nan, [0.0, 0.0, 0.0, 1.0])
+        rows = np.column_stack([rows, turns])
     there = np.flatnonzero(~np.isnan(rows[:, 1:]).all(axis=1))
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
-    P = np.empty((0, 6, 6)) if covariances is None else covariances
+    P = np.empty((0, 6, 6)) if P is None else P
     part = np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2))
     table.check(part, "a covariance of finite numbers")
-    times, notes = in_seconds(table, times, unit)
+    times, notes = in_seconds(table, rows[:, 0], unit)
     return Log(times, T, P, said, notes, oriented=oriented)
+
+
+def planar(table: Table, rows: Rows, unit: str = "") -> Log:
+    """A log of rows `t x y θ`."""
+    times, notes = in_seconds(table, rows[:, 0], unit)
+    return Log(times, of_xytheta(rows[:, 1:]), np.empty((0, 3, 3)), notes=notes)
 
 
 def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple[str, ...]]:
@@ -143,11 +152,7 @@ def symmetric(
 
 
 def interpolated(
-    times: Float[np.ndarray, " m"],
-    poses: Float[np.ndarray, "m d d"],
-    at: Float[np.ndarray, " n"],
-    *,
-    beyond: bool = False,
+    times: Float[np.ndarray, " m"], poses: Stack, at: Times, *, beyond: bool = False
 ) -> Float[np.ndarray, "n d d"]:
     """Poses between those of increasing `times`: positions linearly, rotations along the shortest.
 
@@ -163,15 +168,22 @@ def interpolated(
     share = np.clip(share, 0, 1) if beyond else np.where((share < 0) | (share > 1), np.nan, share)
     result = np.tile(np.eye(n + 1), (len(at), 1, 1))
     result[:, :n, n] = first[:, :n, n] + share[:, None] * (second - first)[:, :n, n]
-    turn = np.swapaxes(first[:, :n, :n], 1, 2) @ second[:, :n, :n]
-    if n == 2:
-        angle = share * np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
-        part = of_xytheta(np.column_stack([0 * angle, 0 * angle, angle]))[:, :2, :2]
-    else:
-        there = np.isfinite(share) & np.isfinite(turn).all(axis=(1, 2))
-        part = np.full((len(at), 3, 3), np.nan)
-        vector = Rotation.from_matrix(turn[there]).as_rotvec()
-        part[there] = Rotation.from_rotvec(share[there, None] * vector).as_matrix()
-    result[:, :n, :n] = first[:, :n, :n] @ part
-    result[np.isnan(result).any(axis=(1, 2))] = np.nan
+    vectors = share[:, None] * turns(first, second)
+    there = ~np.isnan(vectors).any(axis=1)
+    part = Rotation.from_rotvec(vectors[there]).as_matrix()[:, :n, :n]
+    result[there, :n, :n] = first[there, :n, :n] @ part
+    result[~there | np.isnan(result).any(axis=(1, 2))] = np.nan
+    return result
+
+
+def turns(first: Stack, second: Stack) -> Float[np.ndarray, "n 3"]:
+    """The rotation vectors from poses to others, about the axes of the body; NaN where one is."""
+    from scipy.spatial.transform import Rotation
+
+    n = first.shape[-1] - 1
+    R = np.swapaxes(first[:, :n, :n], 1, 2) @ second[:, :n, :n]
+    there = ~np.isnan(R).any(axis=(1, 2))
+    whole, result = np.tile(np.eye(3), (there.sum(), 1, 1)), np.full((len(R), 3), np.nan)
+    whole[:, :n, :n] = R[there]
+    result[there] = Rotation.from_matrix(whole).as_rotvec()
     return result

@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric, unit_in
+from jaxslam.io.logs.log import MIXED, Log, log, planar, symmetric, unit_in
 from jaxslam.io.text import Table
-from jaxslam.io.tum import of_xytheta
 
 _BEFORE = r"(?:(?:field|msg|pose|transform|position|translation|pos|trans)[._ ]?)*"
 _TURN = (
@@ -43,16 +41,18 @@ def read(table: Table) -> Log | None:
     time = named["t"]
     unit = unit_in(table.titles[time])
     expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
-    times = table.numbers(expected, [time])[:, 0]
+    table.numbers(expected, [time])
     if "z" not in named:
-        return _planar(table, times, unit, table.numbers(expected, [named[x] for x in "xyθ"]))
-    turned = all(f"q{axis}" in named for axis in "xyzw")
-    turns = table.rows[:, [named[f"q{axis}"] for axis in "xyzw"]] if turned else None
+        rows = table.numbers(expected, [named[x] for x in "txyθ"])
+        if any("deg" in title.lower() for title in table.titles):
+            rows[:, 3] = np.radians(rows[:, 3])
+        return planar(table, rows, unit)
+    turns = ["qx", "qy", "qz", "qw"]
+    columns = [*"txyz", *(turns if named.keys() >= {*turns} else ())]
     P, said = _covariances(table, named)
     note = "its titles do not say of which error its covariances are: taken as split, mixed"
     notes = (note,) if said is MIXED else ()
-    positions = table.rows[:, [named[x] for x in "xyz"]]
-    found = log(table, times, positions, turns, P, said, unit)
+    found = log(table, table.rows[:, [named[x] for x in columns]], P, said, unit)
     return found._replace(notes=(*found.notes, *notes))
 
 
@@ -69,13 +69,6 @@ def meanings(titles: tuple[str, ...]) -> dict[str, int]:
                 named.setdefault(name.get(what, base), column)
                 break
     return named
-
-
-def _planar(table: Table, times: np.ndarray, unit: str, rows: Float[np.ndarray, "n 3"]) -> Log:
-    degrees = any("deg" in title.lower() for title in table.titles)
-    seconds, notes = in_seconds(table, times, unit)
-    turned = np.column_stack([rows[:, :2], np.radians(rows[:, 2]) if degrees else rows[:, 2]])
-    return Log(seconds, of_xytheta(turned), np.empty((0, 3, 3)), notes=notes)
 
 
 def _covariances(table: Table, named: dict[str, int]) -> tuple[np.ndarray | None, dict[str, str]]:

@@ -37,7 +37,6 @@ def read(table: Table) -> Log | None:
         said[key] = values[value]
     P = symmetric(table.rows[:, 8:], [(i, j) for i in range(6) for j in range(i + 1)])
     convention = {"error": said["TANGENT_CONVENTION"], "order": said["TANGENT_ORDER"]}
-    found = table.rows[:, 0], table.rows[:, 1:4], table.rows[:, 4:8], P
-    result = log(table, *found, convention, said["TIMESTAMP_UNIT"])
+    result = log(table, table.rows[:, :8], P, convention, said["TIMESTAMP_UNIT"])
     world, body = (headers.get(f"{x}_FRAME", "") for x in ("POSE", "BODY"))
     return result._replace(world=world, body=body)

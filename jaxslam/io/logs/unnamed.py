@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam._runtime.files import LARGEST
-from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric
+from jaxslam.io.logs.log import MIXED, Log, log, planar, symmetric
 from jaxslam.io.text import Table, read_table
-from jaxslam.io.tum import not_rigid, of_xytheta, transforms
+from jaxslam.io.tum import not_rigid, transforms
 
 Reader = Callable[[Table], Log | None]
 EXPECTED = "eight finite numbers t tx ty tz qx qy qz qw (TUM)"
@@ -26,14 +26,13 @@ def _of(columns: int, read: Callable[[Table], Log]) -> Reader:
 
 def _tum(table: Table) -> Log:
     _finite_or_none(table, EXPECTED)
-    return log(table, table.rows[:, 0], table.rows[:, 1:4], table.rows[:, 4:8])
+    return log(table, table.rows)
 
 
 def _planar(table: Table) -> Log:
     rows = table.numbers("four finite numbers t x y θ (s, m, rad)")
     table.check(np.abs(rows).max(axis=1) > LARGEST, f"numbers up to {LARGEST:.0e}")
-    times, notes = in_seconds(table, rows[:, 0])
-    return Log(times, of_xytheta(rows[:, 1:]), np.empty((0, 3, 3)), notes=notes)
+    return planar(table, rows)
 
 
 _KITTI = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)"
@@ -66,7 +65,7 @@ def _pose_to_file(table: Table) -> Log:
     rows = _finite_or_none(table, expected)
     places = [(3 + i, 3 + j) for i, j in UPPER] + UPPER
     P = symmetric(rows[:, 8:], places)
-    return log(table, rows[:, 0], rows[:, 1:4], rows[:, 4:8], P, MIXED)
+    return log(table, rows[:, :8], P, MIXED)
 
 
 def _state(table: Table) -> Log | None:
@@ -77,7 +76,7 @@ def _state(table: Table) -> Log | None:
     if columns < 19 or columns - 19 not in (*_of_cameras(table.rows[:, 18], 15, (0, 30)),):
         return None
     rows = table.numbers(f"{columns} finite numbers t, q, p and the rest of OpenVINS's state")
-    return log(table, rows[:, 0], rows[:, 5:8], rows[:, 1:5])
+    return log(table, rows[:, [0, 5, 6, 7, 1, 2, 3, 4]])
 
 
 def is_deviations(rows: Float[np.ndarray, "n k"]) -> bool:
@@ -103,7 +102,7 @@ def _w_first(table: Table) -> Log | None:
     unit = np.abs(np.linalg.norm(table.rows[:, 4:8], axis=1) - 1) < _LENGTH
     if not unit.all() or (count == 8 and table.rows[0, 0] < 1e17):
         return None
-    found = log(table, table.rows[:, 0], table.rows[:, 1:4], table.rows[:, [5, 6, 7, 4]])
+    found = log(table, table.rows[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     note = f"{table.path}: {count} columns are taken as t p q …, with w first (EuRoC, VINS-Mono)"
     return found._replace(notes=(*found.notes, note))
 
@@ -111,7 +110,7 @@ def _w_first(table: Table) -> Log | None:
 def _positions(table: Table) -> Log:
     """Positions alone, with the triangle of their covariance: no orientation."""
     rows = table.numbers("10 finite numbers t x y z and the upper triangle of their covariance")
-    return log(table, rows[:, 0], rows[:, 1:4], None, symmetric(rows[:, 4:], UPPER), MIXED)
+    return log(table, rows[:, :4], symmetric(rows[:, 4:], UPPER), MIXED)
 
 
 def _finite_or_none(table: Table, expected: str) -> Float[np.ndarray, "n k"]:
