@@ -244,8 +244,8 @@ def cost_across(state, k):
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_sum_ends_where_one_gaussian_costs_little_and_begins_again_where_much(monkeypatch, share):
     """Pairs are merged, three in a frame, as soon as the cost of the whole is below `ENOUGH`; one
-    that has ended is split for what it costs across the displacement alone: its scale, which nothing
-    observes, becomes as uncertain as that."""
+    that has ended is split for what it costs across the displacement alone: along it is the scale,
+    which nothing observes."""
     state = some_sum()
     monkeypatch.setattr(split_merge, "ENOUGH", float(share * cost_as_one(state)))
     after = split(3)(state)
