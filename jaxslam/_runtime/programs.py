@@ -261,7 +261,9 @@ class _Compiled(NamedTuple):
 
 
 def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.Compiled:
-    own = dict(options.get(jax.default_backend(), {}))
+    # Who asks JAX for few optimisations, as tests do, is to have few here too.
+    chosen = QUICK if jax.config.values["jax_disable_most_optimizations"] else options
+    own = dict(chosen.get(jax.default_backend(), {}))
     for _ in range(len(own)):
         try:
             return lowered.compile(compiler_options=own)
