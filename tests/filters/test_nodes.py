@@ -120,7 +120,7 @@ def batch(slam, geometry):
     told = jnp.asarray(sigma.velocity), jnp.zeros(t)
     J = quick_jit(partial(jacobian, lambda told: sigma.displacement(*told, DT)))(told)
     J = J @ jnp.diag(jnp.concatenate([sigma.velocity_sigma, sigma.noise_sigma]))
-    root = np.linalg.inv(np.linalg.cholesky(J @ J.T))
+    root = jnp.asarray(np.linalg.inv(np.linalg.cholesky(J @ J.T)))
 
     def whitened(delta):
         moves, values = delta[: 4 * t].reshape(4, t), landmarks + delta[4 * t :].reshape(COUNT, -1)
