@@ -15,7 +15,9 @@ import jaxslam  # noqa: E402
 
 project, author, release = "jaxslam", "the authors of jaxslam", jaxslam.__version__
 project_copyright = "the authors of jaxslam, Apache-2.0"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
+if not tags.has("without_sources"):  # .ci/run: to highlight every source takes as long as the rest
+    extensions.append("sphinx.ext.viewcode")
 html_theme, html_title = "furo", f"jaxslam {release}"
 html_copy_source = False
 html_static_path = html_css_files = ["site.css"]

@@ -28,7 +28,7 @@ from IPython.display import display
 import jaxslam
 from jaxslam.plots import GREY, line_style
 
-RUNS = 100 if os.environ.get("JAXSLAM_REDUCED") else 1000
+RUNS = 25 if os.environ.get("JAXSLAM_REDUCED") else 1000
 
 
 def study(name, filters):

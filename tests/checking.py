@@ -26,17 +26,31 @@ class _UnknownError(Exception):
 
 def _kind(x: Any) -> Any:
     kind = type(x)
+    try:
+        look = _looks[kind]
+    except KeyError:
+        look = _looks[kind] = _look(x)
+    return kind if look is None else (kind, *look(x))
+
+
+_looks: dict[type, Callable[[Any], Any] | None] = {}
+"""Of each type what a check looks at beside it: whether it is an array takes JAX a while to say."""
+
+
+def _look(x: Any) -> Callable[[Any], Any] | None:
     if isinstance(x, _ARRAYS):
-        return kind, x.shape, x.dtype
+        return lambda x: (x.shape, x.dtype)
     if isinstance(x, tuple):
-        return kind, *map(_kind, x)
+        return partial(map, _kind)
     if isinstance(x, type):
-        return kind, x
-    if isinstance(x, list | dict | set | frozenset):
-        if len(x) > _ITEMS:
-            raise _UnknownError
-        return kind, *map(_kind, x), *map(_kind, x.values() if isinstance(x, dict) else ())
-    return kind
+        return lambda x: (x,)
+    return _items if isinstance(x, list | dict | set | frozenset) else None
+
+
+def _items(x: Any) -> Any:
+    if len(x) > _ITEMS:
+        raise _UnknownError
+    return *map(_kind, x), *map(_kind, x.values() if isinstance(x, dict) else ())
 
 
 def _checked_result(function: FunctionType, typechecker: Any, result: Any) -> Callable[..., Any]:

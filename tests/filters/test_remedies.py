@@ -202,27 +202,32 @@ def second_update(name, geometry):
     controls = start.controls()
 
     def run():
-        state = slam.init(6, first)
-        for i in range(2):
-            now, fresh = (jax.tree.map(lambda x, i=i: x[i], part) for part in (known, new))
-            state, _ = slam.step(state, controls[i], now, fresh)
-        before = slam.predict(state, controls[2])
+        def step(state, frame):
+            return slam.step(state, *frame)[0], None
+
+        two = jax.tree.map(lambda x: x[:2], (controls, known, new))
+        before = slam.predict(jax.lax.scan(step, slam.init(6, first), two)[0], controls[2])
         seen = jax.tree.map(lambda x: x[2], known)
-        return before, seen, *slam.update(before, controls[2], seen)
+        return before, seen, slam.update(before, controls[2], seen)[0]
 
     return slam, *quick_jit(run)()
 
 
 def test_fej2_is_the_update_by_the_left_null_space():
     """Of H − H₁, by an SVD: mean and covariance but for the transport are those of what is left."""
-    slam, before, seen, after, _ = second_update("world+fej2", PLANAR)
-    first = replace(before, landmarks=before.first)
-    parts = [observe(slam.model, x, seen.slots, COMPOSED) for x in (before, first)]
-    H, H_first = (placed(part[2], seen.slots, len(before.active)) for part in parts)
+    slam, before, seen, after = second_update("world+fej2", PLANAR)
+
+    @quick_jit
+    def observed(state):
+        part = observe(slam.model, state, seen.slots, COMPOSED)
+        return part[0], placed(part[2], seen.slots, len(before.active))
+
+    expected, H = observed(before)
+    _, H_first = observed(replace(before, landmarks=before.first))
     used = np.repeat(seen.valid & before.active[seen.slots], 2)
     assert used.sum() >= 6
     H, H_first = np.asarray(H)[used], np.asarray(H_first)[used]
-    residual = np.asarray(seen.measured - parts[0][0]).ravel()[used]
+    residual = np.asarray(seen.measured - expected).ravel()[used]
     U, sizes, _ = np.linalg.svd(H - H_first)
     rank = int(np.sum(sizes > 1e-9 * sizes[0]))
     assert rank == 1  # of the heading
@@ -238,17 +243,20 @@ def test_fej2_is_the_update_by_the_left_null_space():
 @pytest.mark.parametrize("geometry", quick_rows(1, [PLANAR, SPATIAL]), ids=named)
 def test_a_decoupled_correction_moves_the_pose_by_its_group(geometry):
     """`Exp(ξ) pose`, ξ of the additive correction of the same gain; landmarks are as in FEJ."""
-    slam, before, _, after, _ = second_update("world+decoupled", geometry)
+    slam, before, seen, after = second_update("world+decoupled", geometry)
     plain = replace(
         slam, correction=positions(geometry).filter("world+fej", "cartesian").correction
     )
-    _, _, seen, *_ = second_update("world+fej", geometry)
-    added, _ = quick_jit(lambda: plain.update(before, positions(geometry).controls()[2], seen))()
-    start = replace(before, landmarks=before.first)
-    _, L = rigid_directions(slam.model, start)
-    moved = exp(geometry.group, L @ minus(added, before))
-    expected = moved @ before.core.pose.joined()
-    close(after.core.pose.joined().as_matrix(), expected.as_matrix(), 1e-12)
+
+    @quick_jit
+    def expected():
+        added, _ = plain.update(before, positions(geometry).controls()[2], seen)
+        _, L = rigid_directions(slam.model, replace(before, landmarks=before.first))
+        moved = exp(geometry.group, L @ minus(added, before)) @ before.core.pose.joined()
+        return added, moved.as_matrix(), after.core.pose.joined().as_matrix()
+
+    added, moved, pose = expected()
+    close(pose, moved, 1e-12)
     close(after.landmarks, added.landmarks, 1e-12)
     difference = after.core.pose.translation - added.core.pose.translation
     assert np.abs(difference).max() > 1e-9
@@ -257,7 +265,7 @@ def test_a_decoupled_correction_moves_the_pose_by_its_group(geometry):
 def test_oc_in_the_world_is_the_affine_filter():
     """Song et al., arXiv:2412.10809: with a rotation's error in B, `P ← A P Aᵀ`, A the identity but
     for `S(p) − S(p⁺)` of the position and of every landmark."""
-    slam, before, seen, after, _ = second_update("world+oc", SPATIAL)
+    slam, before, seen, after = second_update("world+oc", SPATIAL)
     control = positions(SPATIAL).controls()[2]
     plain = replace(slam, correction=positions(SPATIAL).filter("world", "cartesian").correction)
     added, _ = quick_jit(lambda: plain.update(before, control, seen))()

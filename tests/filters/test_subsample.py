@@ -37,6 +37,10 @@ def full(frames=FRAMES):
     return whole(jnp.full(frames - 1, 0.1), measured, seen, jnp.array([0, 1, 3, 0]))
 
 
+fewer_of = quick_jit(thinned)
+"""A window that goes on with every other frame."""
+
+
 def unknowns(slam, record, count=2):
     draw = np.random.default_rng(3)
     size, m = PathLayout.of(slam).size(record.frames), record.first.size
@@ -46,7 +50,7 @@ def unknowns(slam, record, count=2):
 
 def kept(frames, stride=2):
     """The frames of a full window that stay."""
-    stay = every(full(frames), stride, frames)
+    stay = quick_jit(lambda: every(full(frames), stride, frames))()
     return np.asarray(stay.frames[: int(stay.count)])
 
 
@@ -70,7 +74,7 @@ def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames
     """Twice over, so that steps of different lengths are merged too."""
     slam, record = filter_of(treatment), full(frames)
     minima = unknowns(slam, record)
-    fewer, starts = thinned(slam, record, minima)
+    fewer, starts = fewer_of(slam, record, minima)
     before, after = (
         quick_jit(path)(slam, of, of_minima.x[1])
         for of, of_minima in ((record, minima), (fewer, starts))
@@ -83,7 +87,7 @@ def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames
     np.testing.assert_allclose(fewer.controls.sum(), record.controls.sum(), rtol=1e-12)
     assert fewer.merged[: len(stay) - 1].tolist() == np.diff(stay).tolist()
     assert (fewer.merged[len(stay) - 1 :] == 1).all()
-    again, last = thinned(slam, replace(fewer, last=jnp.asarray(frames - 1)), starts)
+    again, last = fewer_of(slam, replace(fewer, last=jnp.asarray(frames - 1)), starts)
     there = quick_jit(path)(slam, again, last.x[1]).motion
     count = len(stay)
     ends = [k for k in stay if k < count]
@@ -96,7 +100,7 @@ def test_a_velocity_drawn_anew_stays_drawn_anew(restart):
     slam, record = filter_of(), full()
     record = replace(record, restarted=record.restarted.at[restart].set(True))
     minima = unknowns(slam, record)
-    fewer, starts = thinned(slam, record, minima)
+    fewer, starts = fewer_of(slam, record, minima)
     step = restart // 2
     assert fewer.restarted.tolist() == [k == step for k in range(FRAMES - 1)]
     length = 0.1 if restart == 1 else 0.2
@@ -111,7 +115,7 @@ def test_landmarks_begin_in_the_first_frame_that_stays():
     """One that only a dropped frame saw is forgotten."""
     slam, record = filter_of(), full()
     minima = unknowns(slam, record)
-    fewer, starts = thinned(slam, record, minima)
+    fewer, starts = fewer_of(slam, record, minima)
     assert fewer.last == 3
     assert fewer.first.tolist() == [0, 1, 0, 0]
     assert fewer.seen[:4, 0].all()
@@ -130,9 +134,10 @@ def test_a_window_is_tied_while_frames_that_stay_share_half_of_their_landmarks(l
     seen = (j <= k) & (k < j + lives)
     measured, first = jnp.zeros((*seen.shape, 2)), jnp.maximum(j, 0)
     record = whole(jnp.full(FRAMES - 1, 0.1), measured, seen, first)
-    assert bool(tied(record)) == holds
+    are_tied = quick_jit(tied)
+    assert bool(are_tied(record)) == holds
     record = full()  # and a frame without light unties nothing
-    assert tied(replace(record, seen=record.seen.at[4].set(False)))
+    assert are_tied(replace(record, seen=record.seen.at[4].set(False)))
 
 
 @pytest.mark.parametrize(
@@ -143,12 +148,17 @@ def test_what_a_coarse_window_says_comes_back_as_the_likeliest_of_the_whole_one(
 ):
     """It is coarse what it was, and of all such unknowns the shortest."""
     slam, record = filter_of(treatment), replace(full(), last=jnp.asarray(last))
-    coarse = Coarse(slam, record, stride, FRAMES - 2 if stride > 1 else FRAMES)
-    size = PathLayout.of(slam).size(coarse.record.frames)
-    draw = np.random.default_rng(5)
-    x = coarse.of(*coarse.back(jnp.asarray(draw.standard_normal(size)), jnp.zeros((4, 3))))[0]
-    fine, _ = coarse.back(x, jnp.zeros((4, 3)))
-    np.testing.assert_allclose(coarse.of(fine, jnp.zeros((4, 3)))[0], x, atol=1e-12)
-    other = draw.standard_normal(PathLayout.of(slam).size(FRAMES))
-    off = jnp.asarray(other) - coarse.back(*coarse.of(jnp.asarray(other), jnp.zeros((4, 3))))[0]
+    frames = FRAMES - 2 if stride > 1 else FRAMES
+    sizes = (PathLayout.of(slam).size(count) for count in (frames, FRAMES))
+    draw, y = np.random.default_rng(5), jnp.zeros((4, 3))
+
+    @quick_jit
+    def there_and_back(some, other):
+        coarse = Coarse(slam, record, stride, frames)
+        x = coarse.of(*coarse.back(some, y))[0]
+        fine, _ = coarse.back(x, y)
+        return x, fine, coarse.of(fine, y)[0], other - coarse.back(*coarse.of(other, y))[0]
+
+    x, fine, again, off = there_and_back(*map(draw.standard_normal, sizes))
+    np.testing.assert_allclose(again, x, atol=1e-12)
     np.testing.assert_allclose(fine @ off, 0.0, atol=1e-10)

@@ -156,15 +156,20 @@ def test_a_record_has_every_measurement_by_frame_and_slot():
 def test_a_slot_of_a_record_is_used_again_removed_and_kept_where_all_is_full():
     record = some_record()
     assert record.full
-    after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]), jnp.eye(1))
+
+    @quick_jit
+    def later(record):
+        after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]), jnp.eye(1))
+        again = removed(begun(record, features([0], [50.0])), jnp.array([False, True, False]))
+        return after, again, record.cut(2)
+
+    after, again, less = later(record)
     jax.tree.map(np.testing.assert_array_equal, after, record)
-    after = removed(begun(record, features([0], [50.0])), jnp.array([False, True, False]))
-    assert after.first[0] == 2
-    np.testing.assert_array_equal(after.seen[:, 0], [False, False, True])
-    assert after.measured[2, 0, 0] == 50
-    assert not after.seen[:, 1].any()
-    np.testing.assert_array_equal(after.seen[:, 2], record.seen[:, 2])
-    less = record.cut(2)
+    assert again.first[0] == 2
+    np.testing.assert_array_equal(again.seen[:, 0], [False, False, True])
+    assert again.measured[2, 0, 0] == 50
+    assert not again.seen[:, 1].any()
+    np.testing.assert_array_equal(again.seen[:, 2], record.seen[:, 2])
     assert (less.frames, int(less.last), less.controls.shape) == (2, 1, (1,))
     np.testing.assert_array_equal(less.seen, record.seen[:2])
     np.testing.assert_array_equal(less.measured, record.measured[:2])
@@ -262,25 +267,27 @@ def test_a_minimum_is_found_within_the_tolerance():
     assert found.cost - minimum(*PLANE).cost < 10 * minimise.TOLERANCE
 
 
-@pytest.mark.parametrize(
-    ("promised", "gained", "settled"),
-    [(4.0, 0.5, True), (6.0, 0.5, False), (4.0, 1.5, False), (4.0, -0.5, False)],
-)
-def test_a_minimum_is_one_only_if_the_step_also_promised_little(
-    promised, gained, settled, monkeypatch
-):
+def test_a_minimum_is_one_only_if_the_step_also_promised_little(monkeypatch):
     """In tolerances. A step that gained little of the much that it promised was too long."""
     slam, record, x, y = case()
     x, unit = 0 * x, jnp.eye(x.size)
-    step = -jnp.sqrt(2 * promised * minimise.TOLERANCE) * unit[0]
-    told = quick_jit(reduced)(slam, record, x, y)._replace(information=unit, gradient=-step)
-    now = replace(started(x, y), cost=jnp.ones(()), damping=jnp.zeros(()))
-    cost = now.cost - 2 * gained * minimise.TOLERANCE - step @ step
-    monkeypatch.setattr(minimise, "reduced", lambda *_: told)
-    monkeypatch.setattr(minimise, "landmarks", lambda *_: (y, cost))
-    after, _ = minimise._step(slam, record, now, told)
-    assert after.converged == settled
-    np.testing.assert_allclose(after.x, step if gained > 0 else x, rtol=1e-12)
+
+    @quick_jit
+    def taken(promised, gained):
+        step = -jnp.sqrt(2 * promised * minimise.TOLERANCE) * unit[0]
+        told = reduced(slam, record, x, y)._replace(information=unit, gradient=-step)
+        now = replace(started(x, y), cost=jnp.ones(()), damping=jnp.zeros(()))
+        cost = now.cost - 2 * gained * minimise.TOLERANCE - step @ step
+        monkeypatch.setattr(minimise, "reduced", lambda *_: told)
+        monkeypatch.setattr(minimise, "landmarks", lambda *_: (y, cost))
+        return minimise._step(slam, record, now, told)[0], step
+
+    for promised, gained, settled in (
+        (4.0, 0.5, True), (6.0, 0.5, False), (4.0, 1.5, False), (4.0, -0.5, False),
+    ):  # fmt: skip
+        after, step = taken(promised, gained)
+        assert after.converged == settled
+        np.testing.assert_allclose(after.x, step if gained > 0 else x, rtol=1e-12)
 
 
 def test_a_landmark_does_not_take_a_step_that_costs_more(monkeypatch):
@@ -460,12 +467,16 @@ def test_a_mode_that_is_next_to_impossible_is_none():
     """Of distinct minima those remain, as modes, whose evidence is not too far below the best."""
     costs = 2 * jnp.array([7.0, 0.0, 2 * modes.NEGLIGIBLE, 0.9 * modes.NEGLIGIBLE])
     at = jax.vmap(started)(10.0 * jnp.eye(4), jnp.zeros((4, 1, 3)))
-    candidates = modes._candidates(replace(at, cost=costs), jnp.ones(4, int))
 
     def weighed(now, record):
         return now._replace(evidence=-now.minimum.cost / 2, information=jnp.eye(4))
 
-    found, _ = modes._likeliest(weighed, case()[1], candidates, jnp.ones(4, bool), 4)
+    @quick_jit
+    def likeliest(record):
+        candidates = modes._candidates(replace(at, cost=costs), jnp.ones(4, int))
+        return modes._likeliest(weighed, record, candidates, jnp.ones(4, bool), 4)[0]
+
+    found = likeliest(case()[1])
     weights = jax.nn.log_softmax(-costs / 2)[jnp.array([1, 0, 3])]
     np.testing.assert_allclose(found.log_weights, jnp.append(weights, -jnp.inf), rtol=1e-12)
     np.testing.assert_array_equal(found.minima.x[:3], at.x[jnp.array([1, 0, 3])])
@@ -474,15 +485,18 @@ def test_a_mode_that_is_next_to_impossible_is_none():
 @pytest.mark.parametrize(("better", "worse", "count"), [(0.25, 4.0, 1), (4.0, 0.25, 2)])
 def test_minima_are_one_by_the_information_of_the_better(better, worse, count):
     """Two at the distance 1: less than one σ of the better, or two."""
-    at = jax.vmap(started)(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 1, 3)))
-    at = modes._candidates(replace(at, cost=jnp.array([2.0, 0.0])), jnp.ones(2, int))
 
     def weighed(now, record):
         told = jnp.where(now.minimum.cost == 0, better, worse) * jnp.eye(2)
         return now._replace(evidence=-now.minimum.cost / 2, information=told)
 
-    found, _ = modes._likeliest(weighed, case()[1], at, jnp.ones(2, bool), 2)
-    assert np.isfinite(found.log_weights).sum() == count
+    @quick_jit
+    def likeliest(record):
+        at = jax.vmap(started)(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 1, 3)))
+        at = modes._candidates(replace(at, cost=jnp.array([2.0, 0.0])), jnp.ones(2, int))
+        return modes._likeliest(weighed, record, at, jnp.ones(2, bool), 2)[0]
+
+    assert np.isfinite(likeliest(case()[1]).log_weights).sum() == count
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -19,14 +19,23 @@ def turning():
     )
 
 
-def run(calibration, sigma=None):
-    """The last state, and covariances of all steps; with other σ of the calibration, if given."""
+@cache
+def with_sigma(treatment):
+    """The filter's run, as a function of σ of its calibration as well."""
+    slam = turning().filter("robocentric", calibration=treatment)
+
+    def run(sigma, *frames):
+        other = replace(slam, calibration=replace(slam.calibration, sigma=sigma))
+        return run_filter(turning().capacity, other, *frames)
+
+    return quick_jit(run)
+
+
+def run(treatment, sigma=None):
+    """The last state, and covariances of all steps, with σ of a calibration that is not known."""
     case = turning()
-    compiled = case.compiled("robocentric", calibration=calibration)
-    if sigma is not None:
-        slam = case.filter("robocentric", calibration=calibration)
-        slam = replace(slam, calibration=replace(slam.calibration, sigma=sigma))
-        compiled = quick_jit(partial(run_filter, case.capacity, slam))
+    known = case.compiled("robocentric", calibration=treatment)
+    compiled = known if sigma is None else partial(with_sigma(treatment), sigma)
     state, (poses, pose_covariances, covariances, nis) = compiled(case.controls(), *case.frames(0))
     return state, np.asarray(covariances), (poses.as_matrix(), pose_covariances, nis)
 
@@ -41,7 +50,7 @@ def test_a_calibration_is_considered_or_estimated():
     sigma = np.sqrt(np.diag(covariances[-1]))
     across = covariances[-1][:3, CALIBRATION] / np.outer(sigma[:3], sigma[CALIBRATION])
     assert np.abs(across).max() > 0.05
-    state, covariances, _ = run("estimated")
+    state, covariances, _ = run("estimated", sigma=np.sqrt(VARIANCES))
     variances = np.diagonal(covariances, axis1=1, axis2=2)[:, CALIBRATION]
     # Rounding of 9 px² is 1e-15.
     assert (variances[0] <= VARIANCES + 1e-12).all()

@@ -169,6 +169,15 @@ def test_every_file_of_the_package_is_among_its_sources():
     assert whole / "filters" / "slam.py" in programs.source_files()
 
 
+@pytest.fixture
+def optimised():
+    """As for users: tests ask JAX for few optimisations."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
+@pytest.mark.usefixtures("optimised")
 def test_only_the_option_that_is_not_known_is_left_out(monkeypatch):
     asked, given = [], {"xla_new": 1, "xla_old": 2}
     compiled = jax.stages.Lowered.compile
@@ -182,6 +191,10 @@ def test_only_the_option_that_is_not_known_is_left_out(monkeypatch):
     monkeypatch.setattr(jax.stages.Lowered, "compile", compile)
     check(Program(scaled, {"cpu": given}))
     assert asked == [given, {"xla_new": 1}]
+    asked.clear()
+    jax.config.update("jax_disable_most_optimizations", True)
+    check(Program(scaled, {"cpu": given}))
+    assert asked == [programs.QUICK["cpu"]]
 
 
 @pytest.mark.parametrize(

@@ -167,6 +167,11 @@ def place_of(chain, number):
     return submaps[0], slots[0]
 
 
+def read(posterior):
+    """All cameras, their covariances, and the variance of a unit."""
+    return *posterior.cameras(), posterior.unit_variance()
+
+
 def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed):
     """Cameras and landmarks of long ago, what was measured since then included; and a loop."""
     chained, ended = smoothed
@@ -187,7 +192,7 @@ def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed):
     )
     assert after.converged
     # The covariances of all cameras, in one pass, are those of each.
-    poses, P = after.cameras()
+    poses, P, _ = eqx.filter_jit(read)(after)
     np.testing.assert_allclose(poses.translation().ravel(), value[: 2 * len(P)], atol=1e-12)
     each = [covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(P))]
     np.testing.assert_allclose(P[:, :2, :2], each, atol=1e-12)
@@ -205,15 +210,15 @@ def test_loops_are_believed_among_wrong_pairs_and_close_the_chain(linear, smooth
     assert believed.valid.tolist() == [True, True, False]
     after = eqx.filter_jit(close)(chained, believed)
     assert after.converged
-    poses, P = after.cameras()
+    poses, P, unit_variance = eqx.filter_jit(read)(after)
     mean, covariance = linear.batch([(*pair, 1e-5) for pair in pairs[:2]])
     np.testing.assert_allclose(poses.translation(), mean.reshape(-1, 2)[ended], atol=1e-6)
     own = [covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in ended]
-    np.testing.assert_allclose(P[:, :2, :2] / after.unit_variance(), own, atol=1e-6)
+    np.testing.assert_allclose(P[:, :2, :2] / unit_variance, own, atol=1e-6)
     links = chained.links
     links = replace(links, root=0.3 * links.root, whitening=links.whitening / 0.3)
     narrow = eqx.filter_jit(close)(replace(chained, links=links), replace(loops, valid=none))
-    for widest, believes in ((closing.WIDEST, True), (1.0, False)):
-        monkeypatch.setattr(closing, "WIDEST", widest)
-        found = agreeing(narrow, replace(loops, valid=right))
-        assert bool(found.valid[:2].all()) == believes
+    given = narrow, replace(loops, valid=right)
+    assert eqx.filter_jit(agreeing)(*given).valid[:2].all()
+    monkeypatch.setattr(closing, "WIDEST", 1.0)
+    assert not eqx.filter_jit(lambda *x: agreeing(*x))(*given).valid[:2].all()
