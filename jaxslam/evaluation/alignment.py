@@ -16,10 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.evaluation.convention import (
+    BLOCK,
     Convention,
     Joints,
     Matrices,
     Squares,
+    blocks,
     change,
     converted,
     geometry_of,
@@ -153,20 +155,29 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
     W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
     `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
-    P, U, n = run.covariances, gauge_directions(run.estimates, run.align), run.truths.shape[-1] - 1
-    V = U.copy()  # of the errors that the fit leaves as they are, Σ Vᵀ e = 0
-    V[:, n:] = 0
-    if line is not None:
-        about = np.outer(line, line)
-        V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
-        V[:, 3:, 3:6] = about
-    VP = np.swapaxes(V, 1, 2) @ P
-    if run.joint is not None:
-        blocks = run.joint.reshape(*P.shape[:2], *P.shape[:2])
-        VP = np.einsum("kta,ktju->jau", V, blocks)
-    UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
-    lost = UW @ VP
-    return P - lost - np.swapaxes(lost, 1, 2) + UW @ np.sum(VP @ V, axis=0) @ np.swapaxes(UW, 1, 2)
+    P, n, result = run.covariances, run.truths.shape[-1] - 1, np.empty_like(run.covariances)
+
+    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        U = gauge_directions(run.estimates[part], run.align)
+        V = U.copy()  # of the errors that the fit leaves as they are, Σ Vᵀ e = 0
+        V[:, n:] = 0
+        if line is not None:
+            about = np.outer(line, line)
+            V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
+            V[:, 3:, 3:6] = about
+        if run.joint is None:
+            return U, V, np.swapaxes(V, 1, 2) @ P[part]
+        return U, V, np.einsum("kta,ktju->jau", V, run.joint.reshape(*P.shape[:2], *P.shape[:2]))
+
+    parts = [*blocks(len(P), BLOCK if run.joint is None else len(P))]
+    sums = [(np.einsum("kta,ktb->ab", V, U), np.sum(VP @ V, axis=0)) for U, V, VP in map(of, parts)]
+    VU, VPV = map(sum, zip(*sums, strict=True))
+    for part in parts:
+        U, _, VP = of(part)
+        UW = U @ np.linalg.pinv(VU)
+        lost = UW @ VP
+        result[part] = P[part] - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
+    return result
 
 
 def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.ndarray, "k t g"]:

@@ -7,7 +7,7 @@ import pytest
 from logs import logged
 
 import jaxslam
-from jaxslam.evaluation import convention, inputs
+from jaxslam.evaluation import alignment, convention, inputs
 from jaxslam.evaluation.inputs import Poses, checked_poses
 
 
@@ -22,6 +22,7 @@ def test_blocks_of_poses_have_the_nees_of_all_together(align, error, monkeypatch
 
     whole = nees()
     monkeypatch.setattr(convention, "blocks", partial(convention.blocks, size=7))
+    monkeypatch.setattr(alignment, "BLOCK", 7)
     monkeypatch.setattr(inputs, "BLOCK", 14)
     monkeypatch.setattr(inputs, "MOST", 20)
     np.testing.assert_allclose(nees(), whole, rtol=1e-9)
