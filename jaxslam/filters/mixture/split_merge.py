@@ -152,8 +152,11 @@ def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
 def _as_late(parts: _Parts, alone: Bool[Array, ""]) -> tuple[_Parts, Float[Array, ""]]:
     """What a split may reach: near the end, and of the only member, only what is across the values,
     the displacement; and what the sum costs as one Gaussian, or the only member across."""
-    cost = jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
-    late = alone | (cost < ACROSS)
+
+    def as_one(parts):
+        return jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
+
+    late = alone | (as_one(parts) < ACROSS)
 
     def across(value, by_core, P):
         squared = value @ value
@@ -162,8 +165,7 @@ def _as_late(parts: _Parts, alone: Bool[Array, ""]) -> tuple[_Parts, Float[Array
         return value, left @ by_core, left @ P @ left
 
     left = _Parts(parts.sum, *jax.vmap(across)(*parts[1:]))
-    of_members = jnp.where(parts.sum.alive, jnp.trace(left.covariances, axis1=1, axis2=2), 0.0)
-    return left, jnp.where(alone, jnp.sum(of_members), cost)
+    return left, jnp.where(alone, as_one(left), as_one(parts))
 
 
 def _planned(
