@@ -258,7 +258,9 @@ def aligned(poses: Poses) -> Aligned:
     for run, own, logged in zip(_runs(here), P, poses.logged, strict=True):
         motion, of_run = _by_first(run, known=notes[0] != BY_ANY) if by_first else _to_all(run)
         T[len(motions), logged] = motion.moved(run.estimates)
-        own[logged] = motion.block @ of_run @ motion.block.T
+        for part in blocks(len(of_run)):
+            of_run[part] = motion.block @ of_run[part] @ motion.block.T
+        own[logged] = of_run
         motions.append(motion)
     joint = None
     if by_first and here.joint is not None and notes[0] != BY_ANY:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import BY_FIRSTS, aligned
-from jaxslam.evaluation.convention import geometry_of, truth_derivatives
+from jaxslam.evaluation.convention import Squares, geometry_of, truth_derivatives
 from jaxslam.evaluation.inputs import ROUNDING, Poses, step_times, whitened, without_known
 from jaxslam.evaluation.result import Evaluation, of_steps
 from jaxslam.evaluation.scale import at_one_scale, of_aligned
+from jaxslam.statistics.bands import Mask, PerAxis
 
 BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
@@ -18,7 +21,13 @@ BEYOND = (
 
 
 def compared(poses: Poses) -> Evaluation:
-    """The verdict in the convention that is stated, without a look at others or at causes.
+    """The verdict in the convention that is stated, without a look at others or at causes."""
+    e, P, logged, words = stated_errors(poses)
+    return of_steps(e, P, logged, **words)
+
+
+def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]:
+    """Errors, their covariances, the steps that were logged, and words for an `Evaluation`.
 
     Without the steps that are known by definition, and the axes without errors if none are named.
     """
@@ -43,20 +52,18 @@ def compared(poses: Poses) -> Evaluation:
         notes += (BEYOND,)
     elif poses.align == "sim3":
         scale = of_aligned(poses, world.log_scale)
-    return of_steps(
-        e,
-        P,
-        poses.logged,
-        quantity="NEES",
-        times=step_times(None, len(logged[0]))[start:],
-        timed=False,
-        names=tuple(poses.names[i] for i in poses.axes),
-        convention=poses.convention,
-        alignment=poses.align,
-        notes=notes,
-        scale=scale,
-        truth_sigma=poses.truth_sigma,
-    )
+    words = {
+        "quantity": "NEES",
+        "times": step_times(None, len(logged[0]))[start:],
+        "timed": False,
+        "names": tuple(poses.names[i] for i in poses.axes),
+        "convention": poses.convention,
+        "alignment": poses.align,
+        "notes": notes,
+        "scale": scale,
+        "truth_sigma": poses.truth_sigma,
+    }
+    return e, P, poses.logged, words
 
 
 def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:

@@ -13,7 +13,7 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
 from jaxslam.evaluation.causes import causes
-from jaxslam.evaluation.comparison import compared
+from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
 from jaxslam.evaluation.inputs import (
@@ -24,7 +24,7 @@ from jaxslam.evaluation.inputs import (
     step_times,
     whitened,
 )
-from jaxslam.evaluation.result import Evaluation, described
+from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.io.text import vector_of
 
@@ -101,14 +101,14 @@ def _identified(poses: Poses) -> Identification:
 
 def _tried(poses: Poses) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
-    found = compared(poses)
+    e, P, logged, words = stated_errors(poses)
+    found = of_steps(e, P, logged, **words)
     turns, parts = np.array([name.startswith("r") for name in found.names]), {}
     for what, block in (("position", ~turns), ("rotation", turns)):
         if block.any():
-            e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
-            nees = filled(squared(whitened(e, P)), found.logged, np.nan)
-            parts[what] = nees, int(block.sum())
-    volume = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
+            z = whitened(e[..., block], P[..., block, :][..., block])
+            parts[what] = filled(squared(z), logged, np.nan), int(block.sum())
+    volume = float(np.linalg.slogdet(P[logged])[1].mean())
     if poses.convention.axes == "rpy":  # angles that follow one another are not orthogonal
         N = turning(poses.convention, poses.estimates[poses.logged])
         volume -= 2 * float(np.linalg.slogdet(N)[1].mean())

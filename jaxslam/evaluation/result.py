@@ -76,8 +76,6 @@ class Evaluation:
     """The error of every run, step and axis; NaN where nothing was logged."""
     sigmas: PerAxis
     """The σ that the filter claims of every error."""
-    covariances: Float[np.ndarray, "runs steps n n"]
-    """The covariances of the errors; identities where nothing was logged."""
     whitened: PerAxis
     """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
     times: Float[np.ndarray, " steps"]
@@ -566,7 +564,6 @@ def of_steps(errors: PerAxis, P: Squares, logged: Mask, **words: Any) -> Evaluat
         whitened=filled(z, logged, np.nan),
         errors=filled(errors, logged, np.nan),
         sigmas=filled(sigmas(P), logged, np.nan),
-        covariances=P,
         **words,
     )
 
@@ -603,7 +600,6 @@ def evaluate_nees(
         nees=values,
         errors=none,
         sigmas=none,
-        covariances=np.empty((*values.shape, 0, 0)),
         times=step_times(times, values.shape[1]),
         timed=times is not None,
         names=(),
