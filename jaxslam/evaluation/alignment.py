@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.evaluation.convention import (
-    BLOCK,
     Convention,
     Joints,
     Matrices,
@@ -157,7 +156,7 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
     """
     P, n, result = run.covariances, run.truths.shape[-1] - 1, np.empty_like(run.covariances)
 
-    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def directions(part: slice) -> tuple[np.ndarray, np.ndarray]:
         U = gauge_directions(run.estimates[part], run.align)
         V = U.copy()  # of the errors that the fit leaves as they are, Σ Vᵀ e = 0
         V[:, n:] = 0
@@ -165,16 +164,24 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
             about = np.outer(line, line)
             V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
             V[:, 3:, 3:6] = about
-        if run.joint is None:
-            return U, V, np.swapaxes(V, 1, 2) @ P[part]
-        return U, V, np.einsum("kta,ktju->jau", V, run.joint.reshape(*P.shape[:2], *P.shape[:2]))
+        return U, V
 
-    parts = [*blocks(len(P), BLOCK if run.joint is None else len(P))]
+    of_joint = None
+    if run.joint is not None:
+        joint = run.joint.reshape(*P.shape[:2], *P.shape[:2])
+        of_joint = np.einsum("kta,ktju->jau", directions(slice(None))[1], joint)
+
+    def of(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        U, V = directions(part)
+        return U, V, np.swapaxes(V, 1, 2) @ P[part] if of_joint is None else of_joint[part]
+
+    parts = [*blocks(len(P))]
     sums = [(np.einsum("kta,ktb->ab", V, U), np.sum(VP @ V, axis=0)) for U, V, VP in map(of, parts)]
     VU, VPV = map(sum, zip(*sums, strict=True))
+    W = np.linalg.pinv(VU)
     for part in parts:
         U, _, VP = of(part)
-        UW = U @ np.linalg.pinv(VU)
+        UW = U @ W
         lost = UW @ VP
         result[part] = P[part] - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
     return result

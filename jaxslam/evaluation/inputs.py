@@ -30,7 +30,7 @@ from jaxslam.io.text import read_table, vector_of
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
-Place = Sequence[int | np.integer] | np.ndarray
+RunAndStep = Sequence[int | np.integer] | np.ndarray
 """The numbers of a run, and of a step."""
 ASYMMETRY = 0.1
 """The largest asymmetry of a covariance, in σ of its axes: a filter in float32 makes less. What is
@@ -82,7 +82,7 @@ def check_every_run(logged: Mask) -> None:
         raise ValueError(f"run {run} is all NaN; every run needs at least one step")
 
 
-def at(place: Place) -> str:
+def at(place: RunAndStep) -> str:
     """Name a place as `run 3, step 17`, counted from 0."""
     return f"run {place[0]}, step {place[1]}"
 
@@ -242,7 +242,7 @@ def whitened(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) 
     return result
 
 
-def _whitened(e: Tangents, P: Squares, place: Callable[[np.integer], Place]) -> Tangents:
+def _whitened(e: Tangents, P: Squares, place: Callable[[np.integer], RunAndStep]) -> Tangents:
     """The same of a row of errors, of which `place` tells run and step."""
 
     def refuse(k: np.integer, fault: str) -> NoReturn:

@@ -108,7 +108,7 @@ def read(place: Place) -> Log:
     if 0 < back.sum() <= BACK * len(back):
         log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
-    last = np.append(np.diff(log.times) > 0, True)
+    last = _last_of_each(log.times)
     told = f"stamps that are doubled: {np.sum(~last)}; of each the last pose is used"
     return log if last.all() else _of_rows(log, last, told)
 
@@ -117,6 +117,10 @@ def _of_rows(log: Log, rows: Bool[np.ndarray, " n"], note: str) -> Log:
     P = log.covariances[rows] if len(log.covariances) else log.covariances
     times, poses, notes = log.times[rows], log.poses[rows], (*log.notes, note)
     return log._replace(times=times, poses=poses, covariances=P, notes=notes)
+
+
+def _last_of_each(times: Times) -> Bool[np.ndarray, " n"]:
+    return np.append(np.diff(times) > 0, True)
 
 
 def read_run(run: RunFiles) -> RunLogs:
@@ -135,7 +139,7 @@ def read_run(run: RunFiles) -> RunLogs:
         own = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
         own = _stamped_by(log.times, own)
         _check_times(run.covariance, own.times)
-        last = np.append(np.diff(own.times) > 0, True)
+        last = _last_of_each(own.times)
         own = own._replace(times=own.times[last], covariances=own.covariances[last])
     elif not len(log.covariances):
         raise ValueError(

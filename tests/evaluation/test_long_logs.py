@@ -21,8 +21,8 @@ def test_blocks_of_poses_have_the_nees_of_all_together(align, error, monkeypatch
         return jaxslam.evaluate_poses(T, P, truth, told, align=align).nees
 
     whole = nees()
-    monkeypatch.setattr(convention, "blocks", partial(convention.blocks, size=7))
-    monkeypatch.setattr(alignment, "BLOCK", 7)
+    for module in (alignment, convention):
+        monkeypatch.setattr(module, "blocks", partial(convention.blocks, size=7))
     monkeypatch.setattr(inputs, "BLOCK", 14)
     monkeypatch.setattr(inputs, "MOST", 20)
     np.testing.assert_allclose(nees(), whole, rtol=1e-9)
