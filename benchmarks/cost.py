@@ -41,6 +41,7 @@ class Cost(Benchmark):
         "scale_gauge+directions9",
         "scale_gauge+mixture9",
         "scale_gauge+mixture17",
+        "recommended",
     )
     """Filters; times are relative to the first."""
     landmarks: str = "inverse_scaling"

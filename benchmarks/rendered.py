@@ -2,9 +2,10 @@
 
     python benchmarks/rendered.py --videos /tmp/videos
     python benchmarks/rendered.py --only orbit turn+blur --seeds 0 1
+    python benchmarks/rendered.py films --films /tmp/films
 
 The settings are those of `jaxslam track`. Results are added to `rendered.json`, and their table to
-`docs/sequences.md`.
+`docs/sequences.md`; those of films that somebody else's renderer made to `films.json`.
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table
+from benchmark import RESULTS, Benchmark, number, run_one, table
 from rendered_videos import KINDS, READOUT, rendered_source
 from scipy.stats import chi2
-from sequences import tracked
+from sequences import SETS, tracked
 from stress import LIE
 
+from jaxslam.io.opening import open_source
 from jaxslam.tracking.settings import TrackerSettings
 
 MARK = "<!-- by rendered.py -->"
 """Where the table stands in `docs/sequences.md`."""
+OF_FILMS = "<!-- rendered.py films -->"
 VIDEOS = (*KINDS, "turn+blur+exposure")
 
 Results = dict[str, dict[str, dict[str, Any]]]
@@ -57,6 +60,28 @@ class Rendered(Benchmark):
 
     def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
         yield "sequences.md", MARK, as_table(results)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Films(Benchmark):
+    """The default tracker on films of another renderer."""
+
+    films: Path
+    """A folder of data sets `KIND_NUMBER`, each as `jaxslam track` takes it, with its truth."""
+    out: Path = RESULTS / "films.json"
+    double = False
+
+    def measure(self) -> Iterator[Results]:
+        results: Results = self.found()
+        for truth in sorted(self.films.glob("*_*/groundtruth.txt")):
+            kind, _, seed = truth.parent.name.rpartition("_")
+            if seed not in results.setdefault(kind, {}):
+                results[kind][seed] = measure(open_source(truth.parent), TrackerSettings())
+                print(kind, seed, results[kind][seed], flush=True)
+                yield results
+
+    def tables(self, results: Results) -> Iterator[tuple[str, str, str]]:
+        yield "sequences.md", OF_FILMS, films_table(results)
 
 
 def measure(source, settings: TrackerSettings) -> dict[str, Any]:
@@ -94,6 +119,24 @@ def as_table(results: Results) -> str:
     return f"{said}\n\n{table(header, rows)}"
 
 
+def films_table(results: Results) -> str:
+    """As Markdown, a film a row."""
+    header = ("film", "lost frames", "path", *(f"in {x} % sets" for x in SETS), "NEES/dof")
+    header += ("σ should be ×", "beyond 5 σ", "drift of scale")
+    films = ((f"{kind} {k}", film) for kind, of in results.items() for k, film in of.items())
+    return table(header, (_film(*film) for film in films))
+
+
+def _film(name: str, film: dict[str, Any]) -> list[str]:
+    """The numbers of a film; of one whose unit is never fixed there are no NEES."""
+    nees, lost = film.get("beyond_scale", np.nan), film["frames"] - film["tracked"]
+    shares = [film["error"], *(film.get(f"inside{x}", np.nan) for x in SETS)]
+    numbers = [*(f"{100 * x:.2g} %" for x in shares), f"{nees:.2g}", f"{nees**0.5:.2g}"]
+    last = f"{100 * film.get('lies', np.nan):.2g} %", f"{film.get('drift', np.nan):.2g} σ"
+    cells = [f"{lost:.0f} of {film['frames']:.0f}", *numbers, *last]
+    return [name, *("–" if "nan" in cell else cell for cell in cells)]
+
+
 def _row(name: str, videos: list[dict[str, Any]]) -> list[str]:
     """The numbers of a kind; a camera on the spot has no path, and so no error in its share."""
 
@@ -119,4 +162,4 @@ def _row(name: str, videos: list[dict[str, Any]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    Rendered.run()
+    run_one(Rendered, Films)
