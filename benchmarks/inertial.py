@@ -17,10 +17,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from benchmark import RESULTS, OfRuns, by_batch
+from benchmark import RESULTS, OfRuns
 
 import jaxslam
-from jaxslam.consistency import draw, run_through
+from jaxslam.consistency import run_through
+from jaxslam.consistency.simulator import Simulator
 from jaxslam.geometry import log
 from jaxslam.statistics.bands import chi2_quantile, normalised_squared
 
@@ -85,10 +86,15 @@ def _of_runs(slam, world, options: Inertial) -> tuple[np.ndarray, np.ndarray]:
         errors = zip((orientation, position), PARTS.values(), strict=True)
         return [(normalised_squared(e, covariance[part, part]), e @ e) for e, part in errors]
 
-    room, runs = draw(world, options.runs, seed=options.seed)
+    # Batch by batch, as the readings of all runs together need many gigabytes.
+    simulator = Simulator(world, options.seed, "float64", options.chunk)
+    starts = range(0, options.runs, options.chunk)
+    chunks = tuple(range(start, start + options.chunk) for start in starts)
+    room = simulator.room(chunks, lambda of, parts: ((part, of(part)) for part in parts))
     batch = jax.jit(jax.vmap(lambda run: run_through(slam, room, run, told)[1]))
+    found = [np.array(batch(simulator(chunk)[0])) for chunk in chunks]
     # Of two parts, each NEES and error: runs, steps, part.
-    whole = np.moveaxis(np.array(by_batch(batch, runs, options.chunk)), (0, 1), (-2, -1))
+    whole = np.moveaxis(np.concatenate(found, axis=2), (0, 1), (-2, -1))[: options.runs]
     return whole[..., 0], whole[..., 1]
 
 

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, run_one, table
-from published_worlds import localisation, make, zhang
+from published_worlds import inertial, localisation, make, zhang
 from tyro.conf import Positional
 
 import jaxslam
@@ -139,7 +139,8 @@ RAL, SONG = "Zhang et al. 2017", "Song et al. 2024"
 
 SPELT = {
     "oc": "world+oc", "fej": "world+fej", "fej2": "world+fej2", "decoupled": "world+decoupled",
-    "left": "left-invariant", "composed": "robocentric, composed first",
+    "left": "left-invariant", "turned": "world, about its axes",
+    "composed": "robocentric, composed first",
 }  # fmt: skip
 
 
@@ -195,6 +196,14 @@ STUDIES = {
     "ukfm-localisation": Study(
         "ukfm (Brossard)", localisation, 100, 400, of_parts(2000),
         cartesian(world=(4.91, 275.28, 12.00, 0.76), left=(1.00, 2.02, 11.35, 0.45)), every=100,
+    ),
+    "ukfm-inertial": Study(
+        "ukfm (Brossard)", inertial, 100, 400, of_parts(1),
+        cartesian(
+            turned=(11.35, 276.29, 3.20, 0.82), world=None, invariant=(1.14, 1.37, 2.83, 0.24),
+            left=None,
+        ),
+        every=100,
     ),
     "zhang-1": zhang_of(
         0.01, invariant=(0.25, 0.0058, 1.02, 1.01), fej=(0.29, 0.0071, 1.12, 1.14),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +17,12 @@ from jaxslam.filters.linear.covariance import composed
 from jaxslam.filters.model import COMPOSED, Context
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.slam import Slam
-from jaxslam.filters.words import make_filters, scenario_pieces
-from jaxslam.geometry import PLANAR, SPATIAL, exp, joined
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.models.frame import Keyframe
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, exp, joined, tangent_dim
+from jaxslam.landmarks import LANDMARKS, Cartesian
+from jaxslam.models.frame import AbstractFrame, Keyframe, Robocentric, WorldCentric
 from jaxslam.models.motion import AbstractMotion
-from jaxslam.models.sensors import AbstractSensor, FieldOfView
+from jaxslam.models.sensors import AbstractSensor, FieldOfView, Position
 from jaxslam.simulation import GivenPoints, World
 from jaxslam.simulation.world import AbstractPlacement, count
 
@@ -181,6 +183,81 @@ def localisation() -> World:
     )
 
 
+GRAVITY = np.array([0.0, 0.0, -9.82])
+PERIOD = 0.01
+"""Of the unit, s."""
+
+
+def _accelerations():
+    """Of a circle of 5 m in 30 s, m/s², by differences of its places; at first it is at rest."""
+    angle = np.linspace(0, 2 * np.pi, 3000)
+    place = 5 * np.stack([np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    velocity = np.diff(place, axis=0, prepend=place[:1]) / PERIOD
+    return np.diff(velocity, axis=0, prepend=velocity[:1]) / PERIOD
+
+
+ACCELERATIONS = _accelerations()
+
+
+class Unit(AbstractTold):
+    """An inertial unit without biases, which does not turn, on that circle; its start is the first
+    step. Gravity is known, so that the variables have the orientation R too, as a copy of the
+    pose's, and with it the velocity v: (R, v) is one pose, whose error is that of the filter's.
+    """
+
+    held: AbstractFrame = WorldCentric()
+    """How (R, v) is held, as one pose: with the error of SO(3) × R⁶, or of SE₂(3) on a side."""
+    geometry = SPATIAL
+
+    def nominal(self, step):
+        """What is read of a step, m/s² and rad/s, and σ; of the start its place, m."""
+        begun = step > 0
+        force = jnp.asarray(ACCELERATIONS)[step.astype(int) - 1] - GRAVITY
+        of_start = jnp.array([1.0] * 3 + [math.radians(15)] * 3) / math.sqrt(3)
+        read = jnp.where(begun, force, jnp.array([0.0, 5.0, 0.0]))
+        return jnp.append(read, jnp.zeros(3)), jnp.where(begun, 0.01, of_start)
+
+    def start(self):
+        rest = self.held.from_base_pose(jaxlie.SE3.identity())
+        size = 1 + tangent_dim(rest)
+        return (jnp.zeros(1), rest), jnp.zeros((size, size))
+
+    def _read(self, variables, noise, control):
+        """How a step turns, the force that is read, and its seconds; of the start its place, 0."""
+        step, _ = variables
+        read, sigma = self.nominal(step[0])
+        force, rate = jnp.split(read + sigma * (control + noise), 2)
+        seconds = jnp.where(step[0] > 0, PERIOD, 0.0)
+        return exp(jaxlie.SO3, jnp.where(seconds > 0, rate * seconds, rate)), force, seconds
+
+    def displacement(self, variables, noise, control):
+        turn, force, seconds = self._read(variables, noise, control)
+        attitude = self.held.camera_pose(variables[1])
+        fallen = attitude.translation() * seconds + jnp.asarray(GRAVITY) * seconds**2 / 2
+        moved = attitude.rotation().inverse() @ fallen + force * seconds**2 / 2
+        return joined(turn, jnp.where(seconds > 0, moved, force))
+
+    def next(self, variables, noise, control):
+        turn, force, seconds = self._read(variables, noise, control)
+        step, held = variables
+        pull = joined(jaxlie.SO3.identity(), jnp.asarray(GRAVITY) * seconds)
+        after = pull @ self.held.camera_pose(held) @ joined(turn, force * seconds)
+        return step + 1, self.held.from_base_pose(after.normalize())
+
+
+def inertial() -> World:
+    """ukfm's inertial navigation: a unit at 100 Hz, and three known points that are measured."""
+    return World(
+        motion=Unit(),
+        sensor=Position(0.1, 3),
+        placement=GivenPoints([[0.0, 2.0, 2.0], [-2.0, -2.0, -2.0], [2.0, -2.0, -2.0]]),
+        steps=3000,
+        beacons=3,
+        beacon_sigma=1e-6,
+        name="inertial",
+    )
+
+
 class ComposedFirst(Slam):
     """A robocentric filter whose motion is composed before the update: landmarks move into the new
     camera by the prediction."""
@@ -201,12 +278,48 @@ def left_invariant(**pieces) -> Slam:
     return Slam(**pieces, frame=Keyframe(turn=math.inf, parallax=math.inf))
 
 
-OWN = {"robocentric, composed first": ComposedFirst, "left-invariant": left_invariant}
+class AboutWorldAxes(WorldCentric):
+    """World-centric, with the error of the orientation about the axes of the base: `R ← Exp(θ) R`,
+    where the classical one here is about those of the camera. The inverse of R is held."""
+
+    def from_base_pose(self, T_BC):
+        return SplitPose(T_BC.translation(), T_BC.rotation().inverse())
+
+    def camera_pose(self, held):
+        return joined(held.rotation.inverse(), held.translation)
+
+    def map_from_camera(self, held, step):
+        return self.camera_pose(held) @ step
+
+    def compose(self, held, step):
+        return self.from_base_pose((self.camera_pose(held) @ step).normalize())
+
+
+OWN = {
+    "robocentric, composed first": ComposedFirst,
+    "left-invariant": left_invariant,
+    "world, about its axes": partial(Slam, frame=AboutWorldAxes()),
+}
+HELD = {
+    "invariant": Robocentric(),
+    "left-invariant": Keyframe(),
+    "world, about its axes": AboutWorldAxes(),
+}
+"""How a `Unit` holds (R, v) so that its error is the filter's; as in `world` for others."""
+
+
+class Surveyed(Cartesian):
+    """A known point: the base frame is that of the survey, so that nothing moves it there."""
+
+    def transform(self, T_ab, landmark):
+        return landmark
 
 
 def make(name: str, world: World) -> AbstractFilter:
     """A filter by its name in the tables, `filter/landmarks`."""
     frame, _, landmark = name.partition("/")
-    if frame in OWN:
-        return OWN[frame](**scenario_pieces(world), landmark=LANDMARKS[landmark])
-    return make_filters(world, frame, landmark)[name]
+    pieces: dict[str, Any] = scenario_pieces(world) | {"landmark": LANDMARKS[landmark]}
+    if isinstance(world.motion, Unit):
+        held = Unit(HELD.get(frame, WorldCentric()))
+        pieces |= {"motion": held, "landmark": Surveyed()}
+    return OWN.get(frame, partial(make_filter, frame))(**pieces)
