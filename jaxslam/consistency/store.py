@@ -75,8 +75,9 @@ class FolderStore:
     """
 
     def __init__(
-        self, folder: Path, manifest: Manifest | None = None, *, resume: bool = False
+        self, folder: str | Path, manifest: Manifest | None = None, *, resume: bool = False
     ) -> None:
+        folder = Path(folder)
         self.folder, self._path = folder, folder / "manifest.json"
         self.manifest: Manifest = {"given": _as_json(manifest or {}), "made_by": {}, "filters": {}}
         if self._path.exists():

@@ -60,7 +60,7 @@ def as_html(results: Results) -> str:
 
 def _aligned(cell: tuple[str, int]) -> str:
     text, width = cell
-    return text.ljust(-width) if width < 0 else text.rjust(width)
+    return text.ljust(-width) if width < 0 else f" {text.rjust(width - 1)}"
 
 
 def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
@@ -69,7 +69,7 @@ def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
         yield [f"{name}:", *(f"    {line}" for line in sentences(result.verdict))]
     yield _MAIN
     yield [
-        f"last of {results.steps} steps, {results.runs} runs of seed {results.seed}; "
+        f"last of {results.steps} steps, {results.runs} run{'s' * (results.runs > 1)} of seed {results.seed}; "
         f"a consistent filter has mean NEES {results.reference.nees.dof}; verdicts: "
         "of all steps, the last and each third together, [99 % interval]",
         "lost: NEES above the 99.99 % quantile of χ² now; ever: NEES above a stricter limit at "
@@ -115,7 +115,8 @@ def _last(values: Steps, digits: int) -> str:
     value = values[-1]
     if not math.isfinite(value):
         return "–"
-    return f"{value:.{digits}f}" if abs(value) < 1e4 else f"{value:.2g}"
+    fits = not value or 10**-digits <= abs(value) < 1e4
+    return f"{value:.{digits}f}" if fits else f"{value:.2g}"
 
 
 def _share(values: Steps) -> str:

@@ -98,7 +98,7 @@ def test_consistency_writes_what_others_read_and_resumes(tmp_path, capsys):
         ),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
-        (["track", "--filter", "scale_gauge+lag5"], "modifier lag is no more: a fixed-lag window"),
+        (["track", "--filter", "scale_gauge+oc+mean2"], "modifier mean takes no number, not 2"),
         (
             ["track", "--filter", "world+rays", "--landmarks", "cartesian"],
             "RaySum takes a frame as a whole",
