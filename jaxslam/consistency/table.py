@@ -69,7 +69,7 @@ def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
         yield [f"{name}:", *(f"    {line}" for line in sentences(result.verdict))]
     yield _MAIN
     yield [
-        f"last of {results.steps} steps, {results.runs} run{'s' * (results.runs > 1)} of seed {results.seed}; "
+        f"last of {results.steps} steps, {results.runs} runs of seed {results.seed}; "
         f"a consistent filter has mean NEES {results.reference.nees.dof}; verdicts: "
         "of all steps, the last and each third together, [99 % interval]",
         "lost: NEES above the 99.99 % quantile of χ² now; ever: NEES above a stricter limit at "

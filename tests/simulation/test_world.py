@@ -276,11 +276,13 @@ def test_axes_are_those_of_the_documentation():
 
 
 def test_a_world_is_shown(tmp_path):
-    figure = scenario("circle", steps=3, beacons=3).plot(path=tmp_path / "world.png")
-    assert (tmp_path / "world.png").stat().st_size > 10_000
+    world = scenario("circle", steps=3, beacons=3, landmarks=6, ring_radius=6.0)
+    figure = world.plot(path=tmp_path / "of" / "world.png")
+    assert (tmp_path / "of" / "world.png").stat().st_size > 10_000
     (ax,) = figure.axes
+    assert ax.get_tightbbox().y1 <= figure.bbox.y1  # with its title
     lines = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["beacon, as surveyed"]) == 3
-    assert len(lines["measured"]) + len(lines["never measured"]) == 36
+    assert len(lines["measured"]) + len(lines["never measured"]) == 6
     run = simulated(scenario("handheld", steps=2, landmarks=5))
     assert scenario("handheld", steps=2, landmarks=5).plot(run).axes
