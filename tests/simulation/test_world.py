@@ -180,9 +180,10 @@ def test_numbers_that_make_no_world_are_refused(given, message):
 
 def test_whole_numbers_may_be_those_of_arrays_and_a_world_of_pieces_is_json():
     motion, sensor = jaxslam.Odometry([0.1] * 3), jaxslam.Position(0.1)
-    world = jaxslam.World(motion, sensor, jaxslam.Ring(np.int64(4)), steps=np.arange(4)[3])
+    four: Any = np.int64(4)
+    world = jaxslam.World(motion, sensor, jaxslam.Ring(four), steps=four)
     told = json.loads(json.dumps(world.to_dict(), allow_nan=False))
-    assert scenario("positions", told) == world == scenario(world, steps=3)
+    assert scenario("positions", told) == world == scenario(world, steps=4)
     with pytest.raises(ValueError, match=r"noise_sigma holds nan"):
         jaxslam.Slam(jaxslam.Odometry([math.nan] * 3), sensor, jaxslam.Cartesian())
 
@@ -280,7 +281,9 @@ def test_a_world_is_shown(tmp_path):
     figure = world.plot(path=tmp_path / "of" / "world.png")
     assert (tmp_path / "of" / "world.png").stat().st_size > 10_000
     (ax,) = figure.axes
-    assert ax.get_tightbbox().y1 <= figure.bbox.y1  # with its title
+    around = ax.get_tightbbox()
+    assert around is not None
+    assert around.y1 <= figure.bbox.y1  # with its title
     lines = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["beacon, as surveyed"]) == 3
     assert len(lines["measured"]) + len(lines["never measured"]) == 6
