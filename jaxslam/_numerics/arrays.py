@@ -7,7 +7,8 @@ A module's leaves are NumPy's float64 or arrays of JAX's, so that a filter made 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import equinox as eqx
 import jax
@@ -93,3 +94,33 @@ def check_shape(what: str, array: ArrayLike, *shapes: tuple[int, ...]) -> None:
     if np.shape(array) not in shapes:
         wanted = " or ".join(str(shape) for shape in shapes)
         raise ValueError(f"{what} has shape {np.shape(array)}; it needs {wanted}")
+
+
+def check_numbers(what: str, value: Any, least: str = "") -> None:
+    """Raise ValueError, naming what it is, unless its numbers are finite and of this sign.
+
+    Words, pieces, and numbers that are being traced are let through.
+    """
+    if isinstance(value, tuple | int | float | np.ndarray):
+        for number in np.ravel(value).tolist():
+            if not np.isfinite(number):
+                raise ValueError(f"{what} holds {number}; it must be finite")
+            if least and (number < 0 or (least == "positive" and not number)):
+                wanted = "be positive" if least == "positive" else "not be negative"
+                raise ValueError(f"{what} must {wanted}, not {number}")
+
+
+def check_leaves(module: eqx.Module) -> None:
+    """Raise ValueError, naming it, for a number of a module that is not finite, or a σ below 0."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(module):
+        name = jax.tree_util.keystr(path).lstrip(".")
+        is_sigma = name.endswith("sigma") and np.ndim(leaf) < 2  # else it may be a root R of R Rᵀ
+        check_numbers(name, leaf, "not negative" if is_sigma else "")
+
+
+def check_kinds(module: eqx.Module, kinds: Mapping[str, Any]) -> None:
+    """Raise ValueError, naming it, for a piece of a module that is not one of its kind."""
+    for name, kind in kinds.items():
+        if not isinstance(piece := getattr(module, name), kind):
+            wanted = (get_args(kind) or (kind,))[0].__name__
+            raise ValueError(f"{name} is an instance of {wanted}, not {piece!r}")

@@ -30,10 +30,12 @@ LARGEST = 1e100
 def write_atomically(path: str | Path) -> Generator[Path, None, None]:
     """Yield a temporary name beside `path`; the file or folder there becomes `path` at the end.
 
-    After an exception what is temporary is removed and an older `path` stays as it was. The
-    temporary name ends like `path`, since many writers choose the format by it.
+    Folders above it are made. After an exception what is temporary is removed and an older `path`
+    stays as it was. The temporary name ends like `path`, since many writers choose the format by
+    it.
     """
     path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         yield temporary

@@ -41,8 +41,8 @@ def _main(given: list[str]) -> None:
     except BrokenPipeError:  # whoever read standard output has enough, as `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is flushed at the end
         sys.exit(_BROKEN_PIPE)
-    except OSError as error:  # a path that is too long, a folder that may not be written
-        _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
+    except OSError as end:  # a path that is too long, a folder that may not be written, a full disk
+        _fail(2, f"{textwrap.shorten(str(end.filename or 'writing'), 80)}: {end.strerror or end}")
     except KeyboardInterrupt as interrupt:
         told = f": {interrupt}" if str(interrupt) else ""
         _fail(_INTERRUPTED, f"interrupted{told}")

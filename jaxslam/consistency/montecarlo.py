@@ -196,6 +196,8 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
             "no filters by name: a dict is accepted, as make_filters gives it, or a list of words "
             "as ['robocentric', 'recommended']"
         )
+    if wrong := [name for name in filters if not isinstance(name, str) or not name]:
+        raise ValueError(f"the name of a filter is a word, not {wrong[0]!r}")
     if wrong := [n for n, slam in filters.items() if not isinstance(slam, AbstractFilter)]:
         raise ValueError(f"{wrong[0]} is no AbstractFilter but {type(filters[wrong[0]]).__name__}")
     return filters

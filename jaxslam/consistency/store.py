@@ -75,8 +75,9 @@ class FolderStore:
     """
 
     def __init__(
-        self, folder: Path, manifest: Manifest | None = None, *, resume: bool = False
+        self, folder: str | Path, manifest: Manifest | None = None, *, resume: bool = False
     ) -> None:
+        folder = Path(folder)
         self.folder, self._path = folder, folder / "manifest.json"
         self.manifest: Manifest = {"given": _as_json(manifest or {}), "made_by": {}, "filters": {}}
         if self._path.exists():
@@ -87,7 +88,6 @@ class FolderStore:
                 self.manifest = found
             for path in self._own(found, unfinished=resume):
                 path.unlink(missing_ok=True)
-        folder.mkdir(parents=True, exist_ok=True)
         write_json(self._path, self.manifest)
 
     @staticmethod
@@ -117,7 +117,6 @@ class FolderStore:
         if filter_name not in self.manifest["filters"]:
             self.begin(self.manifest["made_by"], {filter_name: None})
         path = self._chunk(filter_name, chunk)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **records)
 
@@ -178,7 +177,7 @@ def _check_records(path: Path, runs: int, records: Records) -> None:
         raise ValueError(f"{path} holds other records than those of {runs} runs: {_DAMAGED}")
 
 
-_ANOTHER_FOLDER = "use another --out or leave --resume out"
+_ANOTHER_FOLDER = "use another folder (--out), or begin again without resume"
 
 
 def _as_json(manifest: Manifest) -> Manifest:

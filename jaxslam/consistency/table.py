@@ -60,7 +60,7 @@ def as_html(results: Results) -> str:
 
 def _aligned(cell: tuple[str, int]) -> str:
     text, width = cell
-    return text.ljust(-width) if width < 0 else text.rjust(width)
+    return text.ljust(-width) if width < 0 else f" {text.rjust(width - 1)}"
 
 
 def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
@@ -115,7 +115,8 @@ def _last(values: Steps, digits: int) -> str:
     value = values[-1]
     if not math.isfinite(value):
         return "–"
-    return f"{value:.{digits}f}" if abs(value) < 1e4 else f"{value:.2g}"
+    fits = not value or 10**-digits <= abs(value) < 1e4
+    return f"{value:.{digits}f}" if fits else f"{value:.2g}"
 
 
 def _share(values: Steps) -> str:

@@ -181,10 +181,11 @@ def tune(
     of JAX. Raises ValueError for names, bounds or logs that do not serve.
     """
     settings, bounds, priors = settings or TuningSettings(), bounds or {}, priors or {}
-    if not logs:
-        raise ValueError("tune needs at least one log, as `measured_run` makes it")
+    logs, held_out = ([x] if isinstance(x, MeasuredRun) else list(x) for x in (logs, held_out))
+    if not logs or not all(isinstance(log, MeasuredRun) for log in logs + held_out):
+        raise ValueError("tune needs logs as `measured_run` makes them, at least one")
     dtype = jnp.result_type(float)
-    slam, logs, held_out = cast(slam, dtype), cast(list(logs), dtype), cast(list(held_out), dtype)
+    slam, logs, held_out = cast(slam, dtype), cast(logs, dtype), cast(held_out, dtype)
     search = _Search.of(slam, names, bounds, priors, settings)
     groups = _grouped(logs)
     before, sums = _fit_and_sums(slam, logs)
@@ -223,7 +224,7 @@ class _Search(eqx.Module):
             for path, leaf in jax.tree_util.tree_leaves_with_path(slam)
             if is_number(leaf)
         }
-        chosen = lookup("number of the filter", list(names), known)
+        chosen = lookup("number of the filter", names, known)
         for kind, table in (("bounds", bounds), ("priors", priors)):
             if unused := set(table) - set(chosen):
                 raise ValueError(f"{kind} of what is not tuned: {', '.join(sorted(unused))}")

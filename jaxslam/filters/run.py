@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray, check_numbers
 from jaxslam.filters.protocol import AbstractFilter, Belief
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose
@@ -125,13 +125,17 @@ def measured_run(
     counts), unless `known` has it, whose slots are numbers of landmarks here. `truth` is T_BC of
     frames 1, 2, …. Raises ValueError for arrays that do not go together.
     """
+    if np.any(np.asarray(frame) != np.asarray(frame, int)):
+        raise ValueError(f"frame holds whole numbers, not {np.ravel(frame).tolist()[:5]}")
     frame, landmark = np.asarray(frame, int), np.asarray(landmark, int)
+    control = np.asarray(control, float) if isinstance(control, list) else control
     steps, measured = len(jax.tree.leaves(control)[0]), np.asarray(measured, float)
     if not len(frame) == len(landmark) == len(measured):
         raise ValueError(
             "frame, landmark and measured need one entry of each measurement, not "
             f"{len(frame)}, {len(landmark)} and {len(measured)}"
         )
+    check_numbers("measured", measured)
     if len(frame) and not 0 <= frame.min() <= frame.max() <= steps:
         raise ValueError(
             f"frames are those before and after {steps} controls, 0 to {steps}, not "

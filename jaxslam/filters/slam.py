@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 from jaxtyping import Array, Bool
 
-from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray, check_kinds, check_leaves
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.gaussian import OneGaussian
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
@@ -171,10 +171,7 @@ def _unending(frame: AbstractFrame) -> AbstractFrame:
 
 def compatible(slam: Slam) -> None:
     """Raise ValueError, naming both and why, for pieces of which one excludes the other."""
-    for name, kind in get_type_hints(Slam).items():
-        if not isinstance(getattr(slam, name), kind):
-            wanted = (get_args(kind) or (kind,))[0].__name__
-            raise ValueError(f"{name} is an instance of {wanted}, not {getattr(slam, name)!r}")
+    check_kinds(slam, get_type_hints(Slam))
     n, found = slam.motion.geometry.point_dim, slam.sensor.point_dim
     if found != n:
         raise ValueError(
@@ -182,6 +179,7 @@ def compatible(slam: Slam) -> None:
             f"points have {n} coordinates, and {type(slam.sensor).__name__} measures points of "
             f"{found}"
         )
+    check_leaves(slam)
     check_calibration(slam.calibration, slam.sensor)
     for excluded, told in _excluded(slam):
         if excluded:
@@ -224,7 +222,7 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
     if slam.start is not None:
         yield (
             slam.mixture is None or not slam.mixture.split,
-            "a start from a window is of a mixture that is split: its members are the modes found",
+            "a start from a window is of a mixture that is split (+mixture): members are its modes",
         )
         yield not moves, f"a start from a window is of a velocity, which {motion} lacks"
         yield not hides, f"a start from a window is for a camera; {sensor} measures metres"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
@@ -113,7 +114,6 @@ recommended mixture. The number that may follow the name is
 - `particles`, `rays`: the greatest depth of a delayed initialisation, m;
 - `nodes`: the parallax after which a node of a map of nodes ends, %.
 """
-_LEFT = {"lag": "a fixed-lag window, slower and less consistent than a mixture, left in 0.6"}
 
 
 def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
@@ -131,7 +131,7 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
         pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
     base, *modifiers = name.split("+")
     make = lookup("filters", [base], FILTERS)[base]
-    parsed = sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0]))
+    parsed = sorted(map(_parsed, modifiers), key=lambda one: list(MODIFIERS).index(one[0]))
     _check_one_of_each([base, *(word for word, _ in parsed)])
     made: AbstractFilter = make(**pieces)
     for word, given in parsed:
@@ -139,7 +139,6 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     return made
 
 
-_ORDER = list(MODIFIERS)
 _ONE_OF = {
     "correction": ("invariant", "fej", "fej2", "oc", "decoupled"),
     "sum of Gaussians": ("directions", "mixture"),
@@ -159,13 +158,9 @@ def _check_one_of_each(words: list[str]) -> None:
 def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
     word = modifier if modifier in MODIFIERS else modifier.rstrip("0123456789")
-    if word in _LEFT:
-        raise ValueError(
-            f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}"
-        )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
-    if number and word in ("fej", "decoupled"):
+    if number and len(signature(MODIFIERS[word]).parameters) < 2:
         raise ValueError(f"modifier {word} takes no number, not {number}")
     return word, [int(number)] if number else []
 

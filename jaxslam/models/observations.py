@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from numbers import Integral
 from typing import NamedTuple
 
 import equinox as eqx
@@ -33,7 +34,7 @@ class Capacity(NamedTuple):
             capacity if isinstance(capacity, Capacity) else Capacity(capacity, capacity, capacity)
         )
         for name, count in made._asdict().items():
-            if not isinstance(count, int) or count < 0 or (name == "landmarks" and count < 1):
+            if not isinstance(count, Integral) or count < 0 or (name == "landmarks" and count < 1):
                 raise ValueError(f"a capacity is of so many {name}, a whole number, not {count!r}")
         return made
 

@@ -29,8 +29,8 @@ Measurement = Float[Array, " p"]
 class FieldOfView(eqx.Module):
     """The part of a simulated world that a sensor sees."""
 
-    range: Float[AnyArray, " 2"] = number_field(default=(0.0, np.inf))
-    """Least and greatest distance, m; not of a camera."""
+    range: Float[AnyArray, " 2"] = number_field(default=(0.0, 1e9))
+    """Least and greatest distance, m; not of a camera. All is seen by default."""
     visible_depth: Number = 0.1
     """Least depth z, m, of a camera."""
     image: Float[AnyArray, " p"] | None = eqx.field(converter=optional_numbers, default=None)

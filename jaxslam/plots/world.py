@@ -40,7 +40,7 @@ def plot_world(
             ax.plot(*places.T, marker, ms=5, mfc=fill, color=colour, label=label)
     tip = track[-1] + 0.08 * np.ptp(np.concatenate([track, seen]), axis=0).max() * ahead
     ax.annotate("", tuple(tip), tuple(track[-1]), arrowprops={"arrowstyle": "->", "lw": 1.5})
-    ax.set(aspect="equal", xlabel="x, m", ylabel="z, m")
+    ax.set(aspect="equal", adjustable="datalim", xlabel="x, m", ylabel="z, m")
     ax.grid(alpha=0.25)
     figure = ax.get_figure(root=True)
     assert figure is not None

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam._numerics.arrays import check_numbers
 from jaxslam.geometry import Geometry
 
 Value = Any
 """The value of a field: a word, a number, a list of them, or a piece of your own."""
-LARGEST_WHOLE = 2**31 - 1
-POSITIVE, NOT_NEGATIVE = "positive", "not negative"
+MOST = 2**31 - 1
 
 
 class Field(NamedTuple):
@@ -25,7 +24,7 @@ class Field(NamedTuple):
     told: str
     """The sentence that says what it is."""
     least: str = ""
-    """`POSITIVE`, `NOT_NEGATIVE`, or nothing: what its numbers have to be."""
+    """`positive`, `not negative`, or nothing: what its numbers have to be."""
     at: tuple[str, ...] = ()
     """The places of a world that it says: the word of a piece, and an attribute of that."""
     count: str | int = 0
@@ -57,6 +56,8 @@ for _name, _field in FIELDS.items():
 OWN = ("motion", "sensor", "placement")
 """Fields that may be a piece of your own: a word `module:Class`, or a table of `type` and what
 that takes, or from Python the piece."""
+_REFUSED = {int: ("a whole number", (str, list, tuple, float)), float: ("a number", (str, list))}
+"""The kinds that the number of a piece must not be of, by the type of its default."""
 ROWS = ("first_pixels", "points")
 """Fields that are lists of lists."""
 
@@ -84,10 +85,8 @@ def coerced(field: str, value: Value, like: Value) -> Value:
     if isinstance(like, tuple):
         return tuple(coerced(field, x, 0.0) for x in ([value] if is_alone(value) else value))
     check(isinstance(value, int | float) and not isinstance(value, bool), "a number")
-    whole = f"a number up to {LARGEST_WHOLE}"
-    check(isinstance(value, float) or abs(value) <= LARGEST_WHOLE, whole)
-    right = isinstance(like, float) or (math.isfinite(value) and value == int(value))
-    check(right, "a whole number")
+    check(isinstance(value, float) or abs(value) <= MOST, f"a number up to {MOST}")
+    check(isinstance(like, float) or value % 1 == 0, "a whole number")
     return type(like)(value)
 
 
@@ -96,26 +95,12 @@ def is_alone(value: Value) -> bool:
     return not isinstance(value, list | tuple)
 
 
-def check_numbers(what: str, value: Value, least: str = "") -> None:
-    """Raise ValueError, naming what it is, unless its numbers are finite and of this sign.
-
-    Words, pieces, and numbers that are being traced are let through.
-    """
-    if isinstance(value, tuple):
-        for element in value:
-            check_numbers(what, element, least)
-    elif isinstance(value, int | float | np.ndarray):
-        for number in np.ravel(value).tolist():
-            if not math.isfinite(number):
-                raise ValueError(f"{what} holds {number}; it must be finite")
-            if (least == POSITIVE and number <= 0) or (least == NOT_NEGATIVE and number < 0):
-                wanted = "be positive" if least == POSITIVE else "not be negative"
-                raise ValueError(f"{what} must {wanted}, not {number}")
-
-
 def check_signs(piece: object, word: str) -> None:
-    """Raise ValueError unless the fields of a piece are finite and of the signs of the table."""
+    """Raise ValueError unless the fields of a piece are of the signs and kinds of the table."""
     for field, place in PLACES[word].items():
         if "." not in place:
-            what = f"{place} of {type(piece).__name__}"
-            check_numbers(what, getattr(piece, place), FIELDS[field].least)
+            what, value = f"{place} of {type(piece).__name__}", getattr(piece, place)
+            told, wrong = _REFUSED.get(type(FIELDS[field].default), ("", ()))
+            if isinstance(value, wrong):
+                raise ValueError(f"{what} must be {told}, not {value!r}")
+            check_numbers(what, value, FIELDS[field].least)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.arrays import AnyArray, Number, number_field
 from jaxslam.geometry import PLANAR, SPATIAL, Pose
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.simulation.fields import check_numbers, check_signs
+from jaxslam.simulation.fields import check_signs
 from jaxslam.simulation.world import AbstractPlacement, World, count
 
 
@@ -153,11 +153,11 @@ class GivenPoints(AbstractPlacement):
         return len(self.positions)
 
     def check(self, world: World) -> None:
-        check_numbers("points", self.positions)
-        if np.ndim(self.positions) != 2 or np.shape(self.positions)[1] != world.geometry.point_dim:
+        shape, n = np.shape(self.positions), world.geometry.point_dim
+        if shape[1:] != (n,) or not shape[0]:
             raise ValueError(
-                f"points need {world.geometry.point_dim} numbers each in a {world.geometry.name} "
-                f"world; their shape is {np.shape(self.positions)}"
+                f"points need {n} numbers each in a {world.geometry.name} world, and one point at "
+                f"least; their shape is {shape}"
             )
 
     def points(self, world: World, key: Array) -> Float[Array, "l n"]:

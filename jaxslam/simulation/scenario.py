@@ -17,13 +17,14 @@ from typing import Any
 
 import equinox as eqx
 
+from jaxslam._numerics.arrays import check_numbers
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import GEOMETRIES
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.sensors import FieldOfView, Pinhole
-from jaxslam.simulation.fields import FIELDS, OWN, PLACES, Value, check_numbers, coerced
+from jaxslam.simulation.fields import FIELDS, OWN, PLACES, Value, coerced
 from jaxslam.simulation.placement import PLACEMENTS, Rays
 from jaxslam.simulation.trajectories import find
 from jaxslam.simulation.world import (
@@ -33,7 +34,6 @@ from jaxslam.simulation.world import (
     Drift,
     Limits,
     World,
-    check_kind,
 )
 
 HANDHELD = "handheld-"
@@ -65,7 +65,7 @@ def scenario(
     """
     changes = {**(overrides or {}), **fields}
     if isinstance(name, World):
-        return _replaced(name.fields, changes) if changes else name
+        return _world(name.fields | _checked(changes)) if changes else name
     if not isinstance(name, str | Path):
         raise ValueError(f"a scenario is a World or the name of one, not {name!r}")
     chosen = _read(Path(name)) if str(name).endswith(".toml") else _named(str(name))
@@ -74,7 +74,7 @@ def scenario(
             f"unknown scenario {str(name)!r}{suggestion(str(name), BUILT_IN)}; known: "
             f"{', '.join(BUILT_IN)}, {HANDHELD}NAME of a trajectory, or a .toml file"
         )
-    return _replaced(chosen, changes)
+    return _world(chosen | _checked(changes))
 
 
 scenario.__doc__ = f"{scenario.__doc__}\n    Fields, each with its default:\n\n" + "".join(
@@ -114,18 +114,13 @@ def _read(path: Path) -> dict[str, Value]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"scenario file {path}: {error}") from None
     base = fields.pop("base", None)
-    start = _named(base) if base else _defaults()
+    start = _named(base) if base else _DEFAULTS
     if start is None:
         raise ValueError(f"{path}: unknown base {base!r}; known: {', '.join(BUILT_IN)}")
     return start | _checked({"name": path.stem, **fields})
 
 
-def _defaults() -> dict[str, Value]:
-    return {name: field.default for name, field in FIELDS.items()}
-
-
-def _replaced(start: Mapping[str, Value], changes: Mapping[str, Any]) -> World:
-    return _world({**start, **_checked(changes)})
+_DEFAULTS = {name: field.default for name, field in FIELDS.items()}
 
 
 def _checked(changes: Mapping[str, Any]) -> dict[str, Value]:
@@ -223,11 +218,9 @@ def own_piece(kind: str, given: Value) -> Value:
         )
     where, _, name = word.partition(":")
     try:
-        piece = getattr(_module(where), name)(**options)
+        return getattr(_module(where), name)(**options)
     except (ImportError, OSError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"scenario field {kind}: {word}: {error}") from error
-    check_kind(kind, piece)
-    return piece
 
 
 def _module(where: str) -> ModuleType:
@@ -253,7 +246,7 @@ def _built_in() -> dict[str, dict[str, Value]]:
     def fields(name: str) -> dict[str, Value]:
         table = dict(tables[name])
         base = table.pop("base", None)
-        return (fields(base) if base else _defaults()) | _checked({**table, "name": name})
+        return (fields(base) if base else _DEFAULTS) | _checked({**table, "name": name})
 
     return {name: fields(name) for name in tables}
 

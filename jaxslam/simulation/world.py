@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
-from operator import attrgetter
+from operator import attrgetter, index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -24,6 +24,8 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.arrays import (
     AnyArray,
     Number,
+    check_kinds,
+    check_leaves,
     check_shape,
     number_field,
     numbers,
@@ -134,7 +136,9 @@ CALIBRATIONS = {
 
 def count(default: int) -> Any:
     """Return a field of a whole number, which is no data: another one makes another program."""
-    return eqx.field(static=True, default=default)
+    return eqx.field(
+        static=True, default=default, converter=lambda x: index(x) if hasattr(x, "__index__") else x
+    )
 
 
 class Limits(eqx.Module):
@@ -194,14 +198,12 @@ class Drift(eqx.Module):
         return self.sigma * jnp.where(wrong, 10.0, 1.0)[:, None] * drifts
 
 
-KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement}
-"""Pieces that may be your own."""
-
-
-def check_kind(name: str, piece: Value) -> None:
-    """Raise ValueError unless a piece is one of its kind."""
-    if not isinstance(piece, KINDS[name]):
-        raise ValueError(f"a world's {name} is an {KINDS[name].__name__}, not {piece!r}")
+KINDS = {
+    "motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement,
+    "calibration": AbstractTrueCalibration, "depth": InverseDepth, "limits": Limits,
+    "view": FieldOfView | None, "drift": Drift | None,
+}  # fmt: skip
+"""The pieces of a world."""
 
 
 class World(eqx.Module):
@@ -243,7 +245,7 @@ class World(eqx.Module):
     placement: AbstractPlacement
     calibration: AbstractTrueCalibration = NominalCalibration()
     depth: InverseDepth = InverseDepth.beyond(3.0)
-    steps: int = eqx.field(static=True, default=100)
+    steps: int = count(100)
     rate: Number = 10.0
     velocity: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
     sway: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
@@ -258,8 +260,7 @@ class World(eqx.Module):
     name: str = eqx.field(static=True, default="world")
 
     def __post_init__(self) -> None:
-        for name in KINDS:
-            check_kind(name, getattr(self, name))
+        check_kinds(self, KINDS)
         if self.view is None:
             self.view = self.sensor.view
         if self.velocity is None:
@@ -271,6 +272,7 @@ class World(eqx.Module):
 
     def __check_init__(self) -> None:
         check_signs(self, "world")
+        check_leaves(self)
         geometry, sensor = self.geometry, type(self.sensor).__name__
         check_shape("the velocity of a world", self.velocity, (geometry.tangent_dim,))
         check_shape("the sway of a world", self.sway, (geometry.tangent_dim,))

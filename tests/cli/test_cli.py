@@ -1,5 +1,6 @@
 """Tests of the command line: files and their keys, errors of one line, resuming."""
 
+import errno
 import itertools
 import json
 import runpy
@@ -98,7 +99,7 @@ def test_consistency_writes_what_others_read_and_resumes(tmp_path, capsys):
         ),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
-        (["track", "--filter", "scale_gauge+lag5"], "modifier lag is no more: a fixed-lag window"),
+        (["track", "--filter", "scale_gauge+oc+mean2"], "modifier mean takes no number, not 2"),
         (
             ["track", "--filter", "world+rays", "--landmarks", "cartesian"],
             "RaySum takes a frame as a whole",
@@ -218,6 +219,17 @@ def test_a_command_within_a_program_does_not_end_it(capsys):
     finally:
         done.set()
         other.join()
+
+
+def test_a_full_disk_is_told(monkeypatch, capsys):
+    def full(given):
+        raise OSError(errno.ENOSPC, "No space left on device", *given)
+
+    monkeypatch.setattr("jaxslam.cli._run", full)
+    for given, told in (([], "writing"), (["film.mp4"], "film.mp4")):
+        with pytest.raises(SystemExit):
+            main(given)
+        assert capsys.readouterr().err == f"jaxslam: {told}: No space left on device\n"
 
 
 def as_a_module(arguments):

@@ -263,6 +263,21 @@ def test_sizes_that_make_no_sense_are_refused(sizes, message):
         check_sizes(*sizes)
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"filters": {1: "world"}}, "the name of a filter is a word, not 1"),
+        ({"filters": {"": "world"}}, "the name of a filter is a word, not ''"),
+        ({"filters": {"a": "world"}}, "a is no AbstractFilter but str"),
+        ({"filters": {}}, "no filters by name"),
+    ],
+)
+def test_filters_that_are_none_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        jaxslam.monte_carlo("matched", runs=2, **given)
+
+
 # --- the summary ---------------------------------------------------------------------------------
 
 

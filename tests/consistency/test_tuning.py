@@ -96,6 +96,7 @@ def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
     assert cost == pytest.approx(0.5 + (np.log(0.02) / np.log(2)) ** 2 / 2, rel=1e-3)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("names", "options", "message"),
     [
@@ -104,7 +105,8 @@ def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
         (["sensor.sigma"], {"bounds": {"motion.noise_sigma": (1, 2)}}, "bounds of what is not"),
         (["sensor.sigma"], {"bounds": {"sensor.sigma": (2, 1)}}, "a least and a greatest"),
         (["sensor.sigma"], {"bounds": {"sensor.sigma": (1, 2)}}, "outside its bounds"),
-        (["sensor.sigma"], {"logs": []}, "needs at least one log"),
+        (["sensor.sigma"], {"logs": []}, "logs as `measured_run` makes them, at least one"),
+        (["sensor.sigma"], {"logs": ["log"]}, "logs as `measured_run` makes them, at least one"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_tuned_is_refused(logs, names, options, message):
@@ -145,6 +147,10 @@ def test_measurements_that_do_not_go_together_are_refused():
         jaxslam.measured_run(np.zeros((2, 3)), [0, 1], [1], np.zeros((2, 2)))
     with pytest.raises(ValueError, match="frames are those before and after 2 controls, 0 to 2"):
         jaxslam.measured_run(np.zeros((2, 3)), [0, 3], [1, 1], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"frame holds whole numbers, not \[0.0, 0.5\]"):
+        jaxslam.measured_run([[0, 0, 0], [0, 0, 0]], [0, 0.5], [1, 1], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="measured holds nan"):
+        jaxslam.measured_run([[0, 0, 0], [0, 0, 0]], [0, 1], [1, 1], np.full((2, 2), np.nan))
 
 
 @pytest.mark.slow  # a gate that shrinks σ to leave out more

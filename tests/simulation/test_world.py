@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy import stats
 import jaxslam
 from jaxslam.geometry import PLANAR
 from jaxslam.models import AnyArray, number_field
+from jaxslam.models.sensors import FieldOfView
 from jaxslam.simulation import BUILT_IN, Limits, Room, as_data, features, scenario, sightings
 from jaxslam.simulation.fields import FIELDS
 from jaxslam.simulation.scenario import parse_override
@@ -129,7 +131,7 @@ def test_pieces_of_ones_own_are_named_in_files(mine):
     np.testing.assert_array_equal(simulated(by_field).points, [[1, 2], [3, 4]])
 
 
-@pytest.mark.usefixtures("mine")
+@pytest.mark.usefixtures("mine", "unchecked")
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -139,7 +141,7 @@ def test_pieces_of_ones_own_are_named_in_files(mine):
         ({"sensor": "sonar"}, "sensor is 'sonar'; known: camera, .*, or module:Class"),
         ({"sensor": {"sigma": 1}}, "scenario field sensor is a word, module:Class, a table"),
         ({"sensor": {"type": "mine:Sonar", "sigm": 1}}, "sensor: mine:Sonar: .*sigm"),
-        ({"sensor": "mine:Walk"}, "a world's sensor is an AbstractSensor, not Walk"),
+        ({"sensor": "mine:Walk"}, "sensor is an instance of AbstractSensor, not Walk"),
         ({"placement": "points"}, "points need 2 numbers each in a planar world"),
         ({"placement": "points", "points": [1, 2]}, "points must be a list of points"),
         ({"beacons": 16}, "beacons: at most the 15 landmarks are accepted"),
@@ -152,6 +154,38 @@ def test_pieces_of_ones_own_are_named_in_files(mine):
 def test_pieces_that_make_no_world_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         scenario("positions", fields)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"motion": jaxslam.Odometry([0.1, math.nan, 0.1])}, "motion.noise_sigma holds nan"),
+        ({"sensor": jaxslam.Position(-0.1)}, "sensor.sigma must not be negative, not -0.1"),
+        ({"sensor": jaxslam.Position}, "sensor is an instance of AbstractSensor, not <class"),
+        ({"view": 3}, "view is an instance of FieldOfView, not 3"),
+        ({"view": FieldOfView([0, math.inf])}, "view.range holds inf; it must be finite"),
+        ({"depth": "near"}, "depth is an instance of InverseDepth, not 'near'"),
+        ({"steps": 2.5}, "steps of World must be a whole number, not 2.5"),
+        ({"beacons": "3"}, "beacons of World must be a whole number, not '3'"),
+        ({"rate": [10.0]}, r"rate of World must be a number, not \[10.0\]"),
+        ({"placement": jaxslam.GivenPoints(np.zeros((0, 2)))}, r"one point at least; .* \(0, 2\)"),
+    ],
+)
+def test_numbers_that_make_no_world_are_refused(given, message):
+    pieces = {"motion": jaxslam.Odometry([0.1] * 3), "sensor": jaxslam.Position(0.1)}
+    with pytest.raises(ValueError, match=message):
+        jaxslam.World(**pieces | {"placement": jaxslam.Ring()} | given)
+
+
+def test_whole_numbers_may_be_those_of_arrays_and_a_world_of_pieces_is_json():
+    motion, sensor = jaxslam.Odometry([0.1] * 3), jaxslam.Position(0.1)
+    four: Any = np.int64(4)
+    world = jaxslam.World(motion, sensor, jaxslam.Ring(four), steps=four)
+    told = json.loads(json.dumps(world.to_dict(), allow_nan=False))
+    assert scenario("positions", told) == world == scenario(world, steps=4)
+    with pytest.raises(ValueError, match=r"noise_sigma holds nan"):
+        jaxslam.Slam(jaxslam.Odometry([math.nan] * 3), sensor, jaxslam.Cartesian())
 
 
 class Sonar(jaxslam.AbstractSensor):
@@ -243,11 +277,15 @@ def test_axes_are_those_of_the_documentation():
 
 
 def test_a_world_is_shown(tmp_path):
-    figure = scenario("circle", steps=3, beacons=3).plot(path=tmp_path / "world.png")
-    assert (tmp_path / "world.png").stat().st_size > 10_000
+    world = scenario("circle", steps=3, beacons=3, landmarks=6, ring_radius=6.0)
+    figure = world.plot(path=tmp_path / "of" / "world.png")
+    assert (tmp_path / "of" / "world.png").stat().st_size > 10_000
     (ax,) = figure.axes
+    around = ax.get_tightbbox()
+    assert around is not None
+    assert around.y1 <= figure.bbox.y1  # with its title
     lines = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["beacon, as surveyed"]) == 3
-    assert len(lines["measured"]) + len(lines["never measured"]) == 36
+    assert len(lines["measured"]) + len(lines["never measured"]) == 6
     run = simulated(scenario("handheld", steps=2, landmarks=5))
     assert scenario("handheld", steps=2, landmarks=5).plot(run).axes
