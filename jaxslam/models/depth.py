@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -50,3 +52,14 @@ class InverseDepth(eqx.Module):
     def beyond(nearest: Number) -> InverseDepth:
         """The paper's: 96 % from `nearest` (d_min, metres) to infinity. Raises ValueError."""
         return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))
+
+    @staticmethod
+    def from_depths(near: Number, far: Number) -> InverseDepth:
+        """Mean and σ of 1/z for depths that are uniform between `near` and `far`, metres.
+
+        `E 1/z = log(f/n)/(f − n)` and `E 1/z² = 1/(n f)`. Raises ValueError unless 0 < near < far.
+        """
+        if not 0 < near < far < math.inf:
+            raise ValueError(f"depths are between 0 < near < far < ∞, not {near} and {far}")
+        mean = math.log(far / near) / (far - near)
+        return InverseDepth(mean, math.sqrt(1 / (near * far) - mean**2))

@@ -13,19 +13,25 @@ import jaxslam
 from jaxslam import InverseDepth
 
 
+@pytest.mark.parametrize(("near", "far"), [(1.0, 6.0), (5.0, 50.0), (2.0, 2.1)])
+def test_uniform_depths_have_the_moments_of_quadrature(near, far):
+    depth = InverseDepth.from_depths(near, far)
+    first, second = (
+        integrate.quad(lambda z, k=k: z**-k / (far - near), near, far)[0] for k in (1, 2)
+    )
+    np.testing.assert_allclose(depth.mean, first, rtol=1e-9)
+    np.testing.assert_allclose(depth.sigma, np.sqrt(second - first**2), rtol=1e-6)
+
+
 @pytest.mark.parametrize("end", ["", "-6dof"])
 def test_the_long_scenarios_are_told_their_depths_or_not(end):
     told, thrown, change = (
         jaxslam.scenario(f"laps-{name}{end}") for name in ("prior", "thrown", "change")
     )
-    near, far = told.depth_range
-    mean, square = (  # of 1/z, where depths are uniform
-        integrate.quad(lambda z, k=k: z**-k / (far - near), near, far)[0] for k in (1, 2)
-    )
+    right = InverseDepth.from_depths(*told.depth_range)
     for world in (told, change):
-        right = (mean, np.sqrt(square - mean**2))
-        np.testing.assert_allclose(world.inverse_depth, right, rtol=1e-6)
-    assert mean > thrown.depth.mean + 2 * thrown.depth.sigma
+        np.testing.assert_allclose(world.inverse_depth, (right.mean, right.sigma), rtol=1e-12)
+    assert right.mean > thrown.depth.mean + 2 * thrown.depth.sigma
     assert thrown.depth_range == told.depth_range == change.depth_range[:2]
 
 
@@ -69,5 +75,8 @@ def test_where_a_common_error_walks_depths_scatter_as_their_mean_does():
 
 
 def test_priors_that_make_no_sense_are_refused():
+    for depths in ((0.0, 1.0), (2.0, 2.0), (1.0, np.inf), (1, np.nan)):
+        with pytest.raises(ValueError, match="between 0 < near < far < ∞, not"):
+            InverseDepth.from_depths(*depths)
     with pytest.raises(ValueError, match="give its σ, common, too"):
         InverseDepth(0.2, 0.1, walk=0.1)
