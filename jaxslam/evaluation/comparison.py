@@ -18,6 +18,9 @@ BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
     "in the estimate's unit"
 )
+CORRELATED = (
+    "if errors of different poses correlate, σ of a right filter may seem too large, or too small"
+)
 
 
 def compared(poses: Poses) -> Evaluation:
@@ -52,6 +55,10 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
         notes += (BEYOND,)
     elif poses.align == "sim3":
         scale = of_aligned(poses, world.log_scale)
+    most = None if world.most is None else world.most[:, start:]
+    by = 1.0 if most is None else float(np.sqrt(np.mean(most[poses.logged])))
+    if by > 1.05:
+        notes += (f"{CORRELATED} by up to {by:.2f}",)
     words = {
         "quantity": "NEES",
         "times": step_times(None, len(logged[0]))[start:],
@@ -62,6 +69,7 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
         "notes": notes,
         "scale": scale,
         "truth_sigma": poses.truth_sigma,
+        "most": most if by > 1 else None,
     }
     return e, P, poses.logged, words
 
