@@ -100,8 +100,8 @@ def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:
     told = list(zip(names, none, strict=True))
     left, used = (tuple(name for name, out in told if out == which) for which in (True, False))
     return poses._replace(used=used), (
-        f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
-        f"as with --axes-used {','.join(used)}",
+        f"{', '.join(left)}: not estimated, as errors are zero, or below a thousandth of σ; left "
+        f"out, as with --axes-used {','.join(used)}",
     )
 
 
