@@ -251,8 +251,8 @@ class Aligned(NamedTuple):
     log_scale: Float[np.ndarray, " runs"] = np.zeros(0)
     """The log of the estimate's unit relative to the truth's, of what was done to every run."""
     most: PerStep | None = None
-    """The most that NEES/n of a right filter is on average, where errors of different poses, which
-    correlate as nobody knows, are taken as independent."""
+    """The most that NEES/n of a right filter is on average, where errors of different poses, whose
+    correlations are unknown, are taken as independent."""
 
 
 def aligned(poses: Poses) -> Aligned:

@@ -18,9 +18,6 @@ BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
     "in the estimate's unit"
 )
-CORRELATED = (
-    "if errors of different poses correlate, σ of a right filter may seem too large, or too small"
-)
 
 
 def compared(poses: Poses) -> Evaluation:
@@ -58,7 +55,8 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
     most = None if world.most is None else world.most[:, start:]
     by = 1.0 if most is None else float(np.sqrt(np.mean(most[poses.logged])))
     if by > 1.05:
-        notes += (f"{CORRELATED} by up to {by:.2f}",)
+        told = "if errors of different poses correlate, σ of a right filter may seem too large, or"
+        notes += (f"{told} too small by up to {by:.2f}",)
     words = {
         "quantity": "NEES",
         "times": step_times(None, len(logged[0]))[start:],

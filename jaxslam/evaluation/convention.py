@@ -318,9 +318,7 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
 def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False) -> Log:
     """The same, as a log without poses; those of `positions` may be of x, y, z alone."""
     table = read_table(path, "covariances", "covariances", "a time and finite numbers")
-    of_names, rows, count = named.read(table), table.rows, table.rows.shape[1]
-    if of_names is not None and len(of_names.covariances):
-        return of_names
+    rows, count = table.rows, table.rows.shape[1]
     told, assumed, of_titles = named.covariances(table, flat=t == 3)
     alone = positions and told is None and count in (4, 7, 10)
     t = 3 if alone else t

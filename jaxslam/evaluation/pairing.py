@@ -267,7 +267,7 @@ def _nothing_in_common(run: RunFiles, other: Place, *times: np.ndarray) -> Value
     )
 
 
-def _of_gps(own: Times, others: Times) -> str:
+def _of_gps(own: Times, others: Float[np.ndarray, " m"]) -> str:
     """The offset that GPS would have, where both would begin together without it; else nothing."""
     late = own.min() - others.min()
     longest = max(np.ptp(own), np.ptp(others))
