@@ -130,8 +130,8 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
     index = int(titles[:1] == ("",))  # a first column without a title, as of pandas
     by_column = {i - index: tuple(column) for i, column in words.items()}
     values = np.array(rows)[:, index:]
-    told = (*comments, *named)
-    return Table(Path(path), told, titles[index:], values, tuple(lines), by_column, separator)
+    above, places = (*comments, *named), tuple(lines)
+    return Table(Path(path), above, titles[index:], values, places, by_column, separator)
 
 
 def cells(line: str, separator: str | None = "?", titles: int = 0) -> list[str]:

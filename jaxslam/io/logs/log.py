@@ -79,7 +79,7 @@ def log(
 
 def without_part(P: Rows) -> Bool[np.ndarray, " n"]:
     """A mask of the matrices that lack some numbers, and not all."""
-    return np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2))
+    return np.asarray(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
 
 
 def planar(table: Table, rows: Rows, unit: str = "") -> Log:
