@@ -2,6 +2,7 @@
 every format in which they are written."""
 
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -191,11 +192,16 @@ def of_sigmas(sigma):
     return sigma[..., None] * np.eye(sigma.shape[-1]) * sigma[..., None, :]
 
 
+def right(cov):
+    """The covariance (split, mixed) of positions and rotations that are independent as right."""
+    result = cov.copy()
+    result[:, :3, :3] = np.swapaxes(R, 1, 2) @ cov[:, :3, :3] @ R
+    return result
+
+
 def right_rotation_first(cov):
-    """The covariance (split, mixed) as GTSAM has it: right, along the body, rotation first."""
-    right = cov.copy()
-    right[:, :3, :3] = np.swapaxes(R, 1, 2) @ cov[:, :3, :3] @ R
-    return np.roll(right, 3, axis=(1, 2))
+    """The same as GTSAM has it, rotation first."""
+    return np.roll(right(cov), 3, axis=(1, 2))
 
 
 def in_the_world(cov):
@@ -229,10 +235,10 @@ def tum(folder, estimate="estimate.txt", covariance="covariance.txt", truth="tru
     write_tum(folder / truth, TIMES, TRUTH)
 
 
-def tum_and(values):
+def tum_and(values, header=HEADER):
     def write(folder):
         tum(folder)
-        lines(folder / "covariance.txt", TIMES, values, header=HEADER)
+        lines(folder / "covariance.txt", TIMES, values, header=header)
 
     return write
 
@@ -319,6 +325,27 @@ def trajectories(titles, said="", between=",", nanoseconds=False, ending="csv"):
             lines(folder / f"{name}.{ending}", *told, header=said, between=between)
 
     return write
+
+
+def titled(titles, *columns, between=","):
+    """One file with covariances, and the truth; titles with a number in braces stand for 36."""
+    told = ",".join(
+        ",".join(x.format(i) for i in range(36 if "{" in x else 1)) for x in titles.split()
+    )
+
+    def write(folder):
+        write_tum(folder / "truth.txt", TIMES, TRUTH)
+        lines(
+            folder / "estimate.csv", *columns, header=f"{told}\n" if told else "", between=between
+        )
+
+    return write
+
+
+def dated(i, row):
+    """A line whose time is a date."""
+    date = datetime.fromtimestamp(float(row[0]), UTC)
+    return " ".join([date.isoformat(" " if i % 2 else "T", "microseconds"), *row[1:]])
 
 
 def of_cnspy(kind, blocks):
@@ -574,6 +601,69 @@ LOGS = {
     ),
     "w first, 17 numbers": Log(
         trajectories("t x y z qw qx qy qz" + 9 * " v", between=" "), spare=True
+    ),
+    "TUM, dates": Log(rewritten(dated)),
+    "TUM, nanoseconds of ORB-SLAM3": Log(
+        trajectories("t x y z qx qy qz qw", between=" ", nanoseconds=True, ending="txt")
+    ),
+    "TUM, variances by titles": Log(
+        tum_and(SIGMA[:, ::-1] ** 2, "# t var_rz var_ry var_rx pos_var_z pos_var_y pos_var_x\n"),
+        OF_SIGMAS,
+    ),
+    "TUM and a triangle": Log(
+        titled("", TIMES, ESTIMATE[:, :3, 3], quaternions(R), right(P)[:, *UPPER], between=" "),
+        rtol=0.02,
+        convention=Convention("right"),
+    ),
+    "titles of ROS' CSV with covariances": Log(
+        titled(
+            "%time field.header.stamp field.pose.pose.position.x field.pose.pose.position.y "
+            "field.pose.pose.position.z field.pose.pose.orientation.x "
+            "field.pose.pose.orientation.y field.pose.pose.orientation.z "
+            "field.pose.pose.orientation.w field.pose.covariance{} "
+            "field.twist.twist.linear.x field.twist.covariance{}",
+            *(1e9 * (TIMES + 0.03), 1e9 * TIMES, ESTIMATE[:, :3, 3], quaternions(R)),
+            *(in_the_world(P), np.ones((STEPS, 37))),
+        ),
+        convention=SPLIT,
+        spare=True,
+    ),
+    "titles of PlotJuggler and ROS 2": Log(
+        titled(
+            "/o/header/stamp/sec /o/header/stamp/nanosec /o/pose/pose/position/x "
+            "/o/pose/pose/position/y /o/pose/pose/position/z /o/pose/pose/orientation/w "
+            "/o/pose/pose/orientation/x /o/pose/pose/orientation/y /o/pose/pose/orientation/z "
+            + " ".join(f"/o/pose/covariance[{i};{j}]" for i, j in zip(*UPPER, strict=True)),
+            *(
+                TIMES // 1,
+                1e9 * (TIMES % 1),
+                ESTIMATE[:, :3, 3],
+                np.roll(quaternions(R), 1, axis=1),
+            ),
+            in_the_world(P)[:, *UPPER],
+        ),
+        convention=SPLIT,
+    ),
+    "titles of angles in degrees, and σ": Log(
+        titled(
+            "time pos_x pos_y pos_z roll_deg pitch_deg yaw_deg rot_std_x rot_std_y rot_std_z "
+            "std_pos_x std_pos_y std_pos_z",
+            *(TIMES, ESTIMATE[:, :3, 3]),
+            Rotation.from_matrix(R).as_euler("ZYX", degrees=True)[:, ::-1],
+            *(SIGMA[:, 3:], SIGMA[:, :3]),
+        ),
+        OF_SIGMAS,
+    ),
+    "titles in a plane, with a covariance": Log(
+        lambda x: (
+            lines(x / "truth.txt", TIMES, FLAT_TRUTH),
+            lines(
+                *(x / "estimate.csv", TIMES, FLAT, FLAT_P[:, *UPPER3]),
+                header="t,x,y,yaw,pxx,pxy,pxh,pyy,pyh,phh\n",
+                between=",",
+            ),
+        ),
+        IN_THE_PLANE,
     ),
     "cnspy, split": Log(of_cnspy("type5", (P[:, :3, :3], P[:, 3:, 3:]))),
     # To the first order of the errors.

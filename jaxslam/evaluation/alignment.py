@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.evaluation.convention import (
+    Axes,
     Convention,
     Joints,
     Matrices,
@@ -27,6 +28,7 @@ from jaxslam.evaluation.convention import (
     lever,
 )
 from jaxslam.evaluation.inputs import MOST, Poses, exactly_known
+from jaxslam.statistics.bands import PerStep
 
 Positions = Float[np.ndarray, "k n"]
 ALIGNMENTS = ("none", "first", "yaw", "se3", "sim3")
@@ -146,15 +148,19 @@ def turned_about(fit: Similarity, line: Float[np.ndarray, " 3"], run: Poses) -> 
     return Similarity(rotation, target - fit.scale * rotation @ centre, fit.scale)
 
 
-def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Squares:
+def projected(
+    run: Poses, line: Float[np.ndarray, " 3"] | None = None
+) -> tuple[Squares, Float[np.ndarray, " k"]]:
     """The covariances of an aligned run in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
 
     About a `line` it is that of `turned_about`. Errors, which are split along the axes of the
     world, are taken as independent of each other's where there is no joint covariance. With
     W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
-    `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
+    `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`. Also returns how large NEES may be if they
+    are dependent, by `most_nees`: of N errors, whatever they are, `VᵀPV` is at most N times that.
     """
     P, n, result = run.covariances, run.truths.shape[-1] - 1, np.empty_like(run.covariances)
+    most = np.ones(len(P))
 
     def directions(part: slice) -> tuple[np.ndarray, np.ndarray]:
         U = gauge_directions(run.estimates[part], run.align)
@@ -182,9 +188,24 @@ def projected(run: Poses, line: Float[np.ndarray, " 3"] | None = None) -> Square
     for part in parts:
         U, _, VP = of(part)
         UW = U @ W
-        lost = UW @ VP
-        result[part] = P[part] - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
-    return result
+        lost, fitted = UW @ VP, UW @ VPV @ np.swapaxes(UW, 1, 2)
+        result[part] = P[part] - lost - np.swapaxes(lost, 1, 2) + fitted
+        if of_joint is None:
+            most[part] = most_nees(P[part], len(P) * fitted, result[part], run.axes)
+    return result, most
+
+
+def most_nees(
+    own: Squares, moved: Squares, assumed: Squares, axes: Axes
+) -> Float[np.ndarray, " k"]:
+    """The most mean NEES/n of errors that are those of `own` and of `moved` covariances together,
+    however both correlate: `(√tr A⁻¹P + √tr A⁻¹M)²/n`, with the `assumed` covariance A."""
+    A, *both = (x[:, axes[:, None], axes] for x in (assumed, own, moved))
+    scale = np.sqrt(np.maximum(np.diagonal(A, axis1=1, axis2=2), np.finfo(float).tiny))
+    A, *both = (x / scale[:, :, None] / scale[:, None] for x in (A, *both))
+    A += 1e-9 * np.eye(len(axes))  # a fit of few poses leaves no variance in some directions
+    share = (np.trace(np.linalg.solve(A, x), axis1=1, axis2=2) / len(axes) for x in both)
+    return sum(np.sqrt(np.maximum(x, 0.0)) for x in share) ** 2
 
 
 def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.ndarray, "k t g"]:
@@ -229,6 +250,9 @@ class Aligned(NamedTuple):
     """How they were aligned."""
     log_scale: Float[np.ndarray, " runs"] = np.zeros(0)
     """The log of the estimate's unit relative to the truth's, of what was done to every run."""
+    most: PerStep | None = None
+    """The most that NEES/n of a right filter is on average, where errors of different poses, whose
+    correlations are unknown, are taken as independent."""
 
 
 def aligned(poses: Poses) -> Aligned:
@@ -261,10 +285,11 @@ def aligned(poses: Poses) -> Aligned:
         truths = here.truths.copy()
         truths[..., :-1, -1] -= here.truths[firsts][:, None, :-1, -1]
         here, given = here._replace(truths=truths), given or align == "sim3"
-    T, P, motions = here.estimates.copy(), here.covariances, []
+    T, P, motions, most = here.estimates.copy(), here.covariances, [], np.ones(poses.logged.shape)
     for run, own, logged in zip(_runs(here), P, poses.logged, strict=True):
-        motion, of_run = _by_first(run, known=notes[0] != BY_ANY) if by_first else _to_all(run)
+        motion, of_run, of_most = _by_first(run, notes[0]) if by_first else _to_all(run)
         T[len(motions), logged] = motion.moved(run.estimates)
+        most[len(motions), logged] = of_most
         for part in blocks(len(of_run)):
             of_run[part] = motion.block @ of_run[part] @ motion.block.T
         own[logged] = of_run
@@ -275,7 +300,7 @@ def aligned(poses: Poses) -> Aligned:
         joint = _joint(here.joint, np.broadcast_to(B, P.shape))
     log_scale = -np.log([motion.scale for motion in motions])
     moved = in_convention(here._replace(estimates=T, joint=joint), poses.convention)
-    return Aligned(moved, given, notes, log_scale)
+    return Aligned(moved, given, notes, log_scale, most)
 
 
 def in_convention(poses: Poses, new: Convention) -> Poses:
@@ -311,44 +336,51 @@ def _small_at_first(poses: Poses) -> bool:
     poses = poses.some()
     n = poses.estimates.shape[-1] - 1
     upright = poses.align == "yaw" and n == 3
-    fixed = np.array([0, 1, 2, 5]) if upright else np.arange(poses.covariances.shape[-1])
     for run in _runs(poses):
-        P, U = run.covariances, gauge_directions(run.estimates, poses.align)
-        J = U @ np.linalg.inv(U[0, fixed])
-        moved = J @ P[0][np.ix_(fixed, fixed)] @ np.swapaxes(J, 1, 2)
+        moved = _moved_by_first(run)
         for part in (slice(0, n), slice(5, 6) if upright else slice(n, None)):
             variance, own = (
-                np.diagonal(x, axis1=1, axis2=2)[:, part].max(axis=1) for x in (moved, P)
+                np.diagonal(x, axis1=1, axis2=2)[:, part].max(axis=1)
+                for x in (moved, run.covariances)
             )
             if np.median(variance) > SMALL**2 * np.median(own):
                 return False
     return True
 
 
-def _by_first(run: Poses, *, known: bool) -> tuple[Similarity, Squares]:
+def _moved_by_first(run: Poses) -> Squares:
+    """The covariances of what the error of the first pose moves every pose by, `U_k U₀⁻¹ e₀`, along
+    the directions that are aligned."""
+    U, n = gauge_directions(run.estimates, run.align), run.truths.shape[-1] - 1
+    fixed = np.array([0, 1, 2, 5]) if run.align == "yaw" and n == 3 else np.arange(U.shape[1])
+    J = U @ np.linalg.inv(U[0, fixed])
+    return J @ run.covariances[0][np.ix_(fixed, fixed)] @ np.swapaxes(J, 1, 2)
+
+
+def _by_first(run: Poses, how: str) -> tuple[Similarity, Squares, Float[np.ndarray, " k"]]:
     """The rigid motion that takes the first pose to the true one, or its position and yaw.
 
-    Where it is not `known`, its error then moves all others, `e_k − U_k U₀⁻¹ e₀`: its covariance is
-    added to theirs as if both were independent.
+    The error of that pose moves all others; where its σ is not small, its covariance is added to
+    theirs as if both were independent.
     """
-    P, n = run.covariances, run.truths.shape[-1] - 1
-    if not known:
-        U = gauge_directions(run.estimates, "se3")
-        J = U[1:] @ np.linalg.inv(U[0])
-        P[1:] += J @ P[0] @ np.swapaxes(J, 1, 2)
+    P, n, most = run.covariances.copy(), run.truths.shape[-1] - 1, np.ones(len(run.estimates))
+    if how != BY_FIRST and run.joint is None:
+        moved = _moved_by_first(run)
+        P[1:] += (how == BY_ANY) * moved[1:]
+        most = most_nees(run.covariances, moved, P, run.axes)
     R = (run.truths[0] @ np.linalg.inv(run.estimates[0]))[:n, :n]
     R = yaw_alone(R) if run.align == "yaw" else R
-    return Similarity(R, run.truths[0, :n, n] - R @ run.estimates[0, :n, n], 1.0), P
+    return Similarity(R, run.truths[0, :n, n] - R @ run.estimates[0, :n, n], 1.0), P, most
 
 
-def _to_all(run: Poses) -> tuple[Similarity, Squares]:
+def _to_all(run: Poses) -> tuple[Similarity, Squares, Float[np.ndarray, " k"]]:
     """The similarity that takes all positions nearest to the true ones."""
     n, yaw, line = run.truths.shape[-1] - 1, run.align == "yaw", None
     positions = run.estimates[:, :n, n], run.truths[:, :n, n]
     fit = similarity(*positions, scaled=run.align == "sim3", yaw=yaw)
     if not yaw and (line := _line(run)) is not None:
         fit = turned_about(fit, line, run)
-    return fit, projected(run, line)
+    return fit, *projected(run, line)
 
 
 def _line(run: Poses) -> Float[np.ndarray, " n"] | None:

@@ -125,8 +125,10 @@ def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
         ("estimate", poses._replace(estimates=_reread(poses.estimates, there))),
         ("truth", poses._replace(truths=_reread(poses.truths, there))),
     ):
-        if off(changed.estimates, changed.truths) < before / 4:
-            fixed = compared(changed)
+        after = off(changed.estimates, changed.truths)
+        fixed = compared(changed) if after < before else found
+        # σ of rotations may be as large as what is left.
+        if after < before / 4 or (_right(fixed) and 10 * _nees(fixed) < _nees(found)):
             return Mistake(
                 f"quaternions of the {name} have w first",
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "

@@ -52,6 +52,11 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
         notes += (BEYOND,)
     elif poses.align == "sim3":
         scale = of_aligned(poses, world.log_scale)
+    most = None if world.most is None else world.most[:, start:]
+    by = 1.0 if most is None else float(np.sqrt(np.mean(most[poses.logged])))
+    if by > 1.05:
+        told = "if errors of different poses correlate, σ of a right filter may seem too large, or"
+        notes += (f"{told} too small by up to {by:.2f}",)
     words = {
         "quantity": "NEES",
         "times": step_times(None, len(logged[0]))[start:],
@@ -62,6 +67,7 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
         "notes": notes,
         "scale": scale,
         "truth_sigma": poses.truth_sigma,
+        "most": most if by > 1 else None,
     }
     return e, P, poses.logged, words
 
@@ -92,8 +98,8 @@ def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:
     told = list(zip(names, none, strict=True))
     left, used = (tuple(name for name, out in told if out == which) for which in (True, False))
     return poses._replace(used=used), (
-        f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
-        f"as with --axes-used {','.join(used)}",
+        f"{', '.join(left)}: not estimated, as errors are zero, or below a thousandth of σ; left "
+        f"out, as with --axes-used {','.join(used)}",
     )
 
 

@@ -315,28 +315,33 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     return CovarianceText(found.times, found.covariances, Convention(**found.said))
 
 
-def covariances_of_file(path: str | Path, t: int = 6) -> Log:
-    """The same, as a log without poses."""
+def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False) -> Log:
+    """The same, as a log without poses; those of `positions` may be of x, y, z alone."""
+    table = read_table(path, "covariances", "covariances", "a time and finite numbers")
+    rows, count = table.rows, table.rows.shape[1]
+    told, assumed, of_titles = named.covariances(table, flat=t == 3)
+    alone = positions and told is None and count in (4, 7, 10)
+    t = 3 if alone else t
     triangle = 1 + t * (t + 1) // 2
     kinds = {
         triangle: f"{triangle} finite numbers, the time and the upper triangle row by row",
         1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row",
         1 + t: f"{1 + t} finite numbers, the time and a σ for each axis",
     }
-    table = read_table(path, "covariances", "covariances", kinds[triangle])
-    of_names, rows = named.read(table), table.rows
-    if of_names is not None and len(of_names.covariances):
-        return of_names
-    count, deviations = rows.shape[1], t == 6 and is_deviations(rows)
+    deviations = t == 6 and is_deviations(rows)
     if deviations:
         kinds[count] = f"{count} finite numbers, OpenVINS's time and deviations"
-    there, expected = ~without_values(rows), kinds.get(count, kinds[triangle])
-    table.check(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1), expected)
-    table.check([count not in kinds], expected)
-    said, unit = _said(table, MIXED if deviations else {})
+    there, expected = ~without_values(rows), kinds.get(count, "; or ".join(kinds.values()))
+    if told is None:
+        table.check(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1), expected)
+        table.check([count not in kinds], expected)
+    said, unit = _said(table, MIXED if deviations else assumed)
     P = np.full((len(rows), t, t), np.nan)
-    times, notes = in_seconds(table, rows[:, 0])
-    if deviations or count == 1 + t:
+    time = 0 if told is None else named.meanings(table.titles).get("t", 0)
+    times, notes = in_seconds(table, rows[:, time])
+    if told is not None:
+        P, notes = told, (*notes, *of_titles)
+    elif deviations or count == 1 + t:
         sigma = rows[there][:, [4, 5, 6, 1, 2, 3] if deviations else range(1, 1 + t)]
         for wrong in sigma[~((sigma >= 0) & (sigma <= LARGEST))][:1]:
             raise ValueError(f"{path}: a σ is {wrong:.3g}; expected 0 to {LARGEST:.0e}")
@@ -346,7 +351,8 @@ def covariances_of_file(path: str | Path, t: int = 6) -> Log:
     else:
         P[there], more = _of_triangle(path, rows[there, 1:], t)
         notes += more
-    names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
+    P = np.pad(P, ((0, 0), (0, 3), (0, 3))) if alone else P
+    names = Convention(**said).names(SPATIAL if P.shape[-1] == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
     return Log(times, np.empty((0, 4, 4)), scale[:, None] * P * scale, said, notes)
 

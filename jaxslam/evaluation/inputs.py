@@ -183,8 +183,8 @@ def without_known(errors: PerAxis, P: Squares, logged: Mask) -> tuple[int, Mask,
     for place in np.argwhere(known & (largest > ROUNDING))[:1]:
         raise ValueError(
             f"the covariance of {at(place)} is zero, and its error is not: "
-            f"{largest[tuple(place)]:.3g}; it must be positive definite, and poses in another "
-            "frame or unit than the truth's need an alignment (--align se3, sim3)"
+            f"{largest[tuple(place)]:.3g}; it must be positive definite. Leave out what is from "
+            "before the filter began; another frame or unit needs an alignment (--align se3, sim3)"
         )
     # In part: what such a pose knows exactly has no degree of freedom.
     variance = np.diagonal(P, axis1=-2, axis2=-1)
@@ -260,7 +260,7 @@ def _whitened(e: Tangents, P: Squares, place: Callable[[np.integer], RunAndStep]
     skewed = np.abs(correlation - transposed).max(axis=(1, 2))
     for k in np.flatnonzero(skewed > ASYMMETRY)[:1]:
         refuse(k, f"is not symmetric (by {skewed[k]:.2g} in σ)")
-    correlation = (correlation + transposed) / 2
+    correlation = correlation / 2 + transposed / 2
     try:
         L = np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:

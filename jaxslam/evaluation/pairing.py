@@ -41,6 +41,10 @@ DENSE = 0.3
 """The largest error of interpolation, in σ of the estimate, of a truth that is interpolated."""
 SPARSE = 3.0
 """The number of poses to every true one from which the estimate is taken at the truth's stamps."""
+ROUNDED = 1e-4
+"""The share of the time between two poses by which stamps that are rounded are others."""
+EPOCHS = (18.0, 315964800.0 - 18.0, 315964800.0)
+"""Seconds between GPS time and UTC since 2017, and between the epochs of GPS and of Unix."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 _SAME = Convention("split", "mixed")
 
@@ -136,7 +140,8 @@ def read_run(run: RunFiles) -> RunLogs:
         )
     own = log
     if run.covariance is not None:
-        own = covariances_of_file(run.covariance, geometry_of(log.poses).tangent_dim)
+        t = geometry_of(log.poses).tangent_dim
+        own = covariances_of_file(run.covariance, t, positions=not log.oriented)
         own = _stamped_by(log.times, own)
         _check_times(run.covariance, own.times)
         last = _last_of_each(own.times)
@@ -258,7 +263,19 @@ def _nothing_in_common(run: RunFiles, other: Place, *times: np.ndarray) -> Value
     spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in times)
     return ValueError(
         f"{run.estimate} and {other} have no time stamps in common {_WITHIN}: {spans}"
+        + _of_gps(*times)
     )
+
+
+def _of_gps(own: Times, others: Float[np.ndarray, " m"]) -> str:
+    """The offset that GPS would have, where both would begin together without it; else nothing."""
+    late = own.min() - others.min()
+    longest = max(np.ptp(own), np.ptp(others))
+    for apart in EPOCHS:
+        if abs(abs(late) - apart) < min(longest, 0.01 * apart):
+            told = f"--time-offset {np.copysign(apart, late):.0f}"
+            return f". One may be of GPS time, which is {apart:.0f} s off: then say {told}"
+    return ""
 
 
 def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndarray, "n t t"]:
@@ -317,7 +334,7 @@ def _truths(logs: RunLogs, log: Log) -> tuple[Matrices, Matrices, list[str]]:
     wrong = _interpolation_error(times, poses)
     sigma = _sigmas(log)
     most = (wrong / sigma)[: 2 if oriented else 1].max()
-    elsewhere, dense = off > 1e-6 * max(gap, step), gap <= SPARSE * step
+    elsewhere, dense = off > ROUNDED * max(gap, step), gap <= SPARSE * step
     if elsewhere and dense and most <= DENSE:
         whole = interpolated(times, poses, log.times)
         # Not across a hole.
@@ -329,7 +346,7 @@ def _truths(logs: RunLogs, log: Log) -> tuple[Matrices, Matrices, list[str]]:
         )
         return whole, log.poses, [note] if most > 0.01 else []
     few = len(np.unique(of)) < LEAST_SHARE * len(times)
-    if not dense and (few or off > 1e-6 * step):
+    if not dense and (few or off > ROUNDED * step):
         rough = (_interpolation_error(log.times, log.poses) / sigma)[: 2 if oriented else 1].max()
         told = f"the truth has a pose every {gap:.3g} s and the estimate every {step:.3g} s"
         if rough > DENSE and few:
@@ -413,7 +430,8 @@ def _check_share(logs: RunLogs, log: Log, true: Matrices, why: list[str]) -> Non
         f"{np.sum(others[0][2])} have a covariance {_WITHIN}, and "
         f"{np.sum(others[1][2])} a truth. {path} has {_held(times)}; the nearest one "
         f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
-        "covering half the duration of the estimate" + "".join(f". Here {x}" for x in why)
+        "covering half the duration of the estimate"
+        + ("".join(f". Here {x}" for x in why) or _of_gps(own, times))
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
-from jaxslam.evaluation.causes import causes
+from jaxslam.evaluation.causes import causes, suspect
 from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
@@ -70,7 +70,9 @@ def evaluate_poses(
     found = compared(poses._replace(align=align, used=names, truth_sigma=sigma))
     poses = poses._replace(align=align, used=found.names, truth_sigma=sigma)
     identified, why = _identified(poses), tuple(causes(poses, found))
-    if not why and identified.doubtful and not identified.stands:
+    if identified.doubtful and found.most is not None and not suspect(found):
+        identified = None  # correlations of errors may be what makes it doubtful
+    if not why and identified and identified.doubtful and not identified.stands:
         best = identified.nees[identified.consistent[0]]
         what = "the convention of the covariances is another"
         why = (Mistake(what, identified.sentence, best),)

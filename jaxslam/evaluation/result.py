@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime import plotted
 from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
-from jaxslam.evaluation.alignment import INDEPENDENT
 from jaxslam.evaluation.convention import Convention, Squares
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
@@ -50,9 +49,6 @@ from jaxslam.statistics.verdict import (
 _MOST_DOF = 1_000_000
 _LISTED = 20
 """The most lost runs that are named in the text; the file names all."""
-ASSUMED = 1.5
-"""The factor by which σ of a right filter may seem wrong where covariances are projected to the
-gauge of all positions as if errors of different poses were independent."""
 OUTSIDE = 0.0027
 """The share of a Gaussian beyond ±3σ."""
 MOST = 1000.0
@@ -100,6 +96,9 @@ class Evaluation:
     """The names of the runs, where they have any."""
     time_offset: tuple[float, float] | None = None
     """By how many seconds the stamps of the estimate are late and its σ, where that was found."""
+    most: PerStep | None = None
+    """The most that NEES/dof of a right filter is on average, if errors of different poses, which
+    the alignment takes as independent, are not; None where it takes none so."""
     causes: tuple[Mistake, ...] = ()
     """What lies between the logs and makes NEES wrong (`jaxslam.evaluation.causes`)."""
 
@@ -137,11 +136,13 @@ class Evaluation:
         with np.errstate(over="ignore"):
             z = self.errors / self.sigmas
             found = self._verdict(z, self.whitened, self.dof, self.fitted)
-        # σ may seem wrong because errors of different poses are taken as independent.
-        wrong = found["word"] in ("over-confident", "under-confident")
-        as_assumed = 1 / ASSUMED < (found["sigma_factor"] or 0.0) < ASSUMED
-        doubted = INDEPENDENT in self.notes and wrong and as_assumed
-        return found | {"word": "cannot tell"} if doubted else found
+            if self.most is None or found["word"] not in ("over-confident", "under-confident"):
+                return found
+            # Of a right filter σ may seem too large by any factor, and too small by this one.
+            least = np.sqrt(self.most)[..., None]
+            certain = self._verdict(z / least, self.whitened / least, self.dof, self.fitted)
+        over = found["word"] == certain["word"] == "over-confident"
+        return found if over else found | {"word": "cannot tell", "p": 1.0}
 
     def _verdict(self, normalised: PerAxis, whitened: PerAxis, dof: int, fitted: float) -> Verdict:
         """The verdict on whitened errors, which are over their σ `normalised`."""

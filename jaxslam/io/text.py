@@ -9,6 +9,7 @@ import codecs
 import math
 import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ from numpy.typing import ArrayLike
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
+"""A date and time of ISO 8601, which is a cell, in whatever columns."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
@@ -33,6 +36,8 @@ class Table(NamedTuple):
     lines: tuple[int, ...]
     words: dict[int, tuple[str, ...]]
     """The cells of the columns whose first is no number."""
+    separator: str | None = None
+    """What is between the cells; None of spaces."""
 
     def place(self, row: int | np.integer) -> str:
         """Name a row by file and line."""
@@ -67,6 +72,8 @@ def text_lines(path: str | Path, what: str = "file", *, comments: bool = False) 
         content = path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot read the {what} ({error.strerror})") from None
+    if content[:2] in (b"\x1f\x8b", b"PK", b"BZ", b"\xfd7"):
+        raise ValueError(f"{path}: is compressed; unpack it first")
     encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
     try:
         lines = content.decode(encoding).splitlines()
@@ -91,7 +98,7 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
 def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
     """The same of the lines of a file."""
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
-    lines = {number: line for number, line in told.items() if not _is_comment(line)}
+    lines = {n: _DATE.sub(r"\1T\2", line) for n, line in told.items() if not _is_comment(line)}
     named = []
     while lines and not any(_number(cell) is not None for cell in cells(lines[min(lines)])):
         named.append(lines.pop(min(lines)))
@@ -100,7 +107,7 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
     first = lines[min(lines)]
     separator = _separator(first)
     count = len(cells(first, separator))
-    titles = _titles([*reversed(named), *reversed(comments)], count)
+    titles = _titles([*reversed(named), *reversed(comments)], count, separator)
     # A last cell may be empty, if there is a title for it.
     last = len(titles) - count if titles else 0
     rows, words = [], {}
@@ -123,7 +130,8 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
     index = int(titles[:1] == ("",))  # a first column without a title, as of pandas
     by_column = {i - index: tuple(column) for i, column in words.items()}
     values = np.array(rows)[:, index:]
-    return Table(Path(path), (*comments, *named), titles[index:], values, tuple(lines), by_column)
+    above, places = (*comments, *named), tuple(lines)
+    return Table(Path(path), above, titles[index:], values, places, by_column, separator)
 
 
 def cells(line: str, separator: str | None = "?", titles: int = 0) -> list[str]:
@@ -157,12 +165,12 @@ def _has_decimal_commas(line: str, separator: str | None) -> bool:
     return bool(found) and whole and len(line.split(separator)) > 1
 
 
-def _titles(lines: Sequence[str], count: int) -> tuple[str, ...]:
+def _titles(lines: Sequence[str], count: int, separator: str | None) -> tuple[str, ...]:
     """The nearest line above the numbers that names each column."""
     for line in lines:
-        for separator in (_separator(line), None):
-            found = line.split(separator)
-            if len(found) in (count, count + 1) and (len(found) == count or separator):
+        for own in (separator, _separator(line), None):
+            found = line.split(own)
+            if len(found) in (count, count + 1) and (len(found) == count or own):
                 titles = [cell.strip().strip("\"'").strip() for cell in found]
                 if len(titles) > count and not titles[-1]:
                     titles.pop()
@@ -201,9 +209,13 @@ def numbers_of(told: object) -> list[float]:
 
 
 def _number(cell: str) -> float | None:
+    """A number, or the seconds from 1970 to a date, of UTC where it says no zone."""
     try:
-        return float(cell)
-    except ValueError:
+        if not _DATE.match(cell):
+            return float(cell)
+        date = datetime.fromisoformat(cell)
+        return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
         return None
 
 

@@ -54,6 +54,13 @@ def test_a_fault_between_the_logs_is_named_with_the_nees_without_it(put, word):
     assert found.headline.startswith("no verdict: ")
 
 
+def test_w_first_is_named_where_rotations_are_uncertain_too():
+    T, P, true = logged(SPLIT, runs=8, steps=STEPS, spread=0.2, factor=3.0)
+    log = benchmark.w_first(np.random.default_rng(0), RIGHT._replace(estimates=T))
+    (cause,) = evaluate_poses(log.estimates, 9 * P, true, SPLIT).mistakes
+    assert "w first" in cause.what
+
+
 def test_a_lever_arm_as_short_as_sigma_is_named_where_all_runs_have_it():
     T, P, true = logged(SPLIT, runs=12, steps=STEPS)
     X = np.eye(4)

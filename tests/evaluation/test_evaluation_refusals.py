@@ -59,6 +59,7 @@ OF_ARRAYS = [
     (arrays(names=["x", "x", "y"]), "names must be 3 different ones"),
     (arrays(quantity="NES"), r"unknown quantity 'NES' .*known: NEES, NIS"),
     (arrays(SET_OUT, KNOWN), r"run 3, step 0 is zero.* is not: 0\.2.*--align"),
+    (spoilt_P((6, 5), np.where(np.eye(3) > 0, 1.0, 1.7e308)), "has an eigenvalue -"),
     (arrays(0 * E, 0 * P), "all covariances are zero"),
     (arrays(changed(E, 3, 0.0), changed(P, 3, 0.0)), "all covariances of run 3 are zero"),
     (nees(-1.0, 3), "NEES of run 0, step 1 is -1; 0 or more"),
@@ -266,6 +267,11 @@ OF_FOLDERS = [
         lambda x: evaluate_log(one_run(x / "run", offset=0.05)),
         r"truth\.txt have no time stamps in common within 0\.01 s",
     ),
+    (
+        lambda x: evaluate_log(one_run(x / "run", offset=18.0 - 315964800.0)),
+        r"One may be of GPS time, which is 315964782 s off: then say --time-offset 315964782",
+    ),
+    (of_text("truth.txt", "PK\x03\x04"), r"truth\.txt: is compressed; unpack it first"),
     (
         shown(lambda t: f"{(t - 1.4e9) * 1e5:.0f}"),  # a hundred a second, in microseconds
         r"times 1e.04 from one to the next look like microseconds or milliseconds; expected "

@@ -35,7 +35,8 @@ def read_log(path: str | Path) -> Log:
         if found is not None:
             return found
     known = "; ".join(name for name, _ in FORMATS)
-    titles = f" ({', '.join(table.titles)})" if table.titles else ""
+    more = ", …" * (len(table.titles) > 12)
+    titles = f" ({', '.join(table.titles[:12])}{more})" if table.titles else ""
     raise ValueError(
         f"{table.place(0)}: {table.rows.shape[1]} columns{titles} are no known format; expected "
         f"{unnamed.EXPECTED}, or one of: {known}"

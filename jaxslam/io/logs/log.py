@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxslam.io.text import Table
 from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
@@ -72,10 +72,14 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if P is None else P
-    part = np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2))
-    table.check(part, "a covariance of finite numbers")
+    table.check(without_part(P), "a covariance of finite numbers")
     times, notes = in_seconds(table, rows[:, 0], unit)
     return Log(times, T, P, said, notes, oriented=oriented)
+
+
+def without_part(P: Rows) -> Bool[np.ndarray, " n"]:
+    """A mask of the matrices that lack some numbers, and not all."""
+    return np.asarray(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
 
 
 def planar(table: Table, rows: Rows, unit: str = "") -> Log:
@@ -105,7 +109,7 @@ def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple
 
 def unit_in(title: str) -> str:
     """The unit that a title says, as `t [us]` or `time_us`; "" where it says none."""
-    found = re.search(r"\[([num]?s)\]|_([num]?s)$", title.lower())
+    found = re.search(r"\[([num]?s)\]|(?:_|time|stamp)([num]?s)(?:ecs?)?$", title.lower())
     return found[found.lastindex or 0] if found else ""
 
 

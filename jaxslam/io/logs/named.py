@@ -3,90 +3,184 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
-from jaxslam.io.logs.log import MIXED, Log, log, planar, symmetric, unit_in
+from jaxslam.io.logs.log import (
+    MIXED,
+    NOTHING,
+    Log,
+    Stack,
+    Words,
+    log,
+    planar,
+    symmetric,
+    unit_in,
+    without_part,
+)
 from jaxslam.io.text import Table
 
-_BEFORE = r"(?:(?:field|msg|pose|transform|position|translation|pos|trans)[._ ]?)*"
-_TURN = (
-    r"(?:(?:field|msg|pose|transform|orientation|rotation|rot|quaternion|quat|att|attitude|q_rs|q)"
-    r"[._ ]?)+"
+_PLACES = ("", "p", "t", "pos", "position", "trans", "translation", "field", "msg", "pose",
+           "transform", "point", "r")  # fmt: skip
+_TURNS = ("q", "quat", "quaternion", "orientation", "rotation", "rot", "att", "attitude")
+_PLACED = {"x": "x", "y": "y", "z": "z", "east": "x", "north": "y", "up": "z"}
+_TURNED = dict(zip("xyzwijk0123", "xyzwxyzwxyz", strict=True))
+_ANGLES = {**dict.fromkeys(("θ", "theta", "yaw", "heading", "th", "psi"), "θ"),
+           "roll": "roll", "phi": "roll", "pitch": "pitch"}  # fmt: skip
+_OTHERS = {"twist", "vel", "velocity", "linear", "angular", "acc", "acceleration", "bias"}
+_TIME = re.compile(
+    r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?)"
+    r"|(?:(?:utc|gps|ros)_?)?(?P<t>t|ts|time|timestamps?|secs?|seconds)(?:_?[num]?s(?:ecs?)?)?"
 )
-_MEANINGS = {
-    "time": re.compile(
-        r"(?:t|(?:field\.)?(?:header\.)?(?:time_?stamps?|stamp|time|secs?|seconds))(?:_?[num]?s)?"
-    ),
-    "position": re.compile(rf"{_BEFORE}(?:t|p|p_rs_r)?[._ ]?([xyz])(?:_m)?"),
-    "turn": re.compile(rf"{_TURN}([xyzw])"),
-    "angle": re.compile(r"(?:θ|theta|yaw|heading|th|psi)(?:_?deg(?:rees)?|_?rad)?"),
-    "variance": re.compile(r"p([xyz]{2})|q([rpy]{2})"),
-}
-_POSITION, _TURNS = "xyz", "rpy"
+_AXIS = r"roll|pitch|yaw|heading|phi|theta|psi|th|θ|r_?[xyz]|[xyzrpth]"
+_SPREAD = re.compile(
+    r"q(?P<cnspy>[rpy]{2})|(?:[pc]|(?:.*_)?(?:(?P<cov>cov|covariance)|(?P<var>var|variance))"
+    r"|(?P<sigma>s|σ|(?:.*_)?(?:sigma|std_?dev|std|stdev|sd)))_?"
+    rf"(?:(?P<number>\d+(?:_\d+)?)|(?P<first>{_AXIS})_?(?P<second>{_AXIS})?)"
+)
+_ORDER = {"x": 0, "y": 1, "z": 2, **dict.fromkeys(("roll", "phi", "rx", "r"), 3),
+          **dict.fromkeys(("pitch", "ry", "p"), 4)}  # fmt: skip
+"""The places of axes in a covariance; any other is the yaw."""
+_ROS = {"error": "split", "axes": "world"}
 _ERRORS = {
     "type1": {"error": "right", "axes": "body"},
     "type2": {"error": "left", "axes": "world"},
-    "type5": {"error": "split", "axes": "mixed"},
+    "type5": MIXED,
 }
 """What cnspy calls the error of a covariance, in its column `est_err_type`."""
 
 
 def read(table: Table) -> Log | None:
     """The poses of a table whose titles name time, position and, if any, orientation; None of
-    others. Variances are `pxx, pxy …` and `qrr, qrp …` of cnspy, with its kind of error."""
-    named = meanings(table.titles)
-    if not {"t", "x", "y"} <= named.keys() or not (named.keys() & {"z", "θ"}):
+    others. Covariances are those of `covariances`. Raises ValueError, naming the line."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    named, rows = meanings(table.titles), table.rows
+    flat = "z" not in named
+    if not {"t", "x", "y"} <= named.keys() or (flat and "θ" not in named):
         return None
-    time = named["t"]
-    unit = unit_in(table.titles[time])
+    titles = {name: table.titles[i] for name, i in named.items()}
     expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
-    table.numbers(expected, [time])
-    if "z" not in named:
-        rows = table.numbers(expected, [named[x] for x in "txyθ"])
-        if any("deg" in title.lower() for title in table.titles):
-            rows[:, 3] = np.radians(rows[:, 3])
-        return planar(table, rows, unit)
-    turns = ["qx", "qy", "qz", "qw"]
-    columns = [*"txyz", *(turns if named.keys() >= {*turns} else ())]
-    P, said = _covariances(table, named)
-    note = "its titles do not say of which error its covariances are: taken as split, mixed"
-    notes = (note,) if said is MIXED else ()
-    found = log(table, table.rows[:, [named[x] for x in columns]], P, said, unit)
+    times, unit = table.numbers(expected, [named["t"]]), unit_in(titles["t"])
+    if "nano" in named and rows[:, named["nano"]].max() < 1e9:
+        times, unit = times + 1e-9 * table.numbers(expected, [named["nano"]]), "s"
+    P, said, notes = covariances(table, flat=flat)
+    if flat:
+        found = table.numbers(expected, [named[x] for x in "xyθ"])
+        found[:, 2] *= _radians(titles["θ"])
+        found = planar(table, np.column_stack([times, found]), unit)
+        return found if P is None else found._replace(covariances=P, said=said)
+    turns = rows[:, [named[x] for x in ("qx", "qy", "qz", "qw") if x in named]]
+    if turns.shape[1] < 4 and {"roll", "pitch", "θ"} <= named.keys():
+        yaw_pitch_roll = rows[:, [named[x] for x in ("θ", "pitch", "roll")]]
+        unit_of_angles = _radians("".join(titles.values()))
+        turns = Rotation.from_euler("ZYX", unit_of_angles * yaw_pitch_roll).as_quat()
+    if P is not None and not turns.shape[1]:
+        P[:, 3:, 3:] = 0.0
+    places = rows[:, [named[x] for x in "xyz"]]
+    found = log(table, np.column_stack([times, places, turns]), P, said, unit)
     return found._replace(notes=(*found.notes, *notes))
 
 
+def _radians(title: str) -> float:
+    return np.pi / 180 if "deg" in title.lower() else 1.0
+
+
+def words(title: str) -> str:
+    """The words of a title, without units and frames: of `p_WB_x [m]` `p_x`; none of velocities."""
+    title = re.sub(r"\b([pqt])(?:_[A-Z]{1,3})+(?=_)", r"\1", title)
+    title = re.sub(r"[\[(](?![xyzw\d])[^\])]*[\])]", "", title.lower())
+    told = re.findall(r"[^\W\d_]+|\d+", title)
+    return re.sub(r"_(m|rad|deg|degrees)$", "", "_".join(told)) if not _OTHERS & {*told} else ""
+
+
 def meanings(titles: tuple[str, ...]) -> dict[str, int]:
-    """The columns of `t`, `x`, `y`, `z`, `qx` … `qw`, `θ`, and of variances as `p` or `q` and two
-    axes; the first of each."""
-    named: dict[str, int] = {}
-    for column, title in enumerate(titles):
-        base = re.sub(r"[\[(].*", "", title.lower()).strip(" #%.")
-        for what, pattern in _MEANINGS.items():
-            if found := pattern.fullmatch(base):
-                axis = found[found.lastindex] if found.lastindex else ""
-                name = {"time": "t", "position": axis, "turn": f"q{axis}", "angle": "θ"}
-                named.setdefault(name.get(what, base), column)
-                break
-    return named
+    """The columns of `t`, `x`, `y`, `z`, `qx` … `qw`, `θ`, `roll`, `pitch`: the first of each, but
+    of times that of a header. They may be in two, the second of which is `nano`."""
+    found: dict[str, int] = {}
+    for column, told in enumerate(map(words, titles)):
+        time = _TIME.fullmatch(told)
+        what = time.lastgroup if time else "" if _spread(told) else _of_pose(told)
+        found.setdefault(what or "", column)
+    times = {x: found.pop(x) for x in ("header", "t", "nano") if x in found}
+    if times:
+        found["t"] = next(iter(times.values()))
+    return found | ({"nano": times["nano"]} if len(times) > 1 and "nano" in times else {})
 
 
-def _covariances(table: Table, named: dict[str, int]) -> tuple[np.ndarray | None, dict[str, str]]:
-    places, columns = [], []
-    for name, column in named.items():
-        axes = _POSITION if name[0] == "p" else _TURNS
-        if len(name) == 3 and name[0] in "pq":
-            places.append(tuple(axes.index(x) + 3 * (axes == _TURNS) for x in name[1:]))
-            columns.append(column)
-    if not {(0, 0), (1, 1), (2, 2)} <= set(places):
-        return None, {}
-    P = symmetric(table.rows[:, columns], places)
-    kinds = {
-        x for i, column in table.words.items() if table.titles[i] == "est_err_type" for x in column
-    }
+def _of_pose(told: str) -> str:
+    """What a title names of a pose: an axis, an angle, or a part of a quaternion."""
+    *before, last = told.split("_")
+    for word, axis in ((before[-1] if before else "", last), (last[:-1], last[-1:])):
+        if word in _PLACES and axis in _PLACED:
+            return _PLACED[axis]
+        if word in _TURNS and axis in _TURNED:
+            return f"q{_TURNED[axis]}"
+    return _ANGLES.get(last, "")
+
+
+def _spread(told: str) -> re.Match[str] | None:
+    """A title as that of a σ, of a variance, or of a number of a covariance."""
+    told = re.sub(r"(?:^|_)(?:rot|rotation|ori|orientation|att|attitude)_(.*_)?([xyz])$",
+                  r"_\1r\2", told).strip("_")  # fmt: skip
+    told = re.sub(r"_(?:p|pos|position|trans|translation)_([xyz])$", r"_\1", told)
+    found = _SPREAD.fullmatch(told)
+    if found is None:
+        return None
+    one, alone = found["sigma"] or found["var"], found["first"] and not found["second"]
+    return found if bool(alone) == bool(one) or (found["cov"] and alone) else None
+
+
+def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, tuple[str, ...]]:
+    """The covariances that titles name, words of their `Convention`, and notes: σ and variances by
+    axes, as `std_x` and `var_yaw`; pairs, as `pxy`; numbers, as `P12`, and `covariance7` of ROS;
+    and `qrp` of cnspy, with its kind of error. An axis without any has the variance −1. None where
+    no title names those of x and y and, unless all is `flat`, z. Raises ValueError."""
+    told = {i: x for i, title in enumerate(table.titles) if (x := _spread(words(title)))}
+    places = iter(_places([x["number"] for x in told.values() if x["number"]]))
+    cells, axes = {}, MIXED
+    for i, found in told.items():
+        names = [x.replace("_", "") for x in found.group("first", "second") if x]
+        place = [_ORDER.get(x, 5) for x in names]
+        place = place or ["rpy".index(x) + 3 for x in found["cnspy"] or ""]
+        place = place or next(places, (6, 6))
+        if flat and max(place) < 5:  # of x, y and yaw
+            place = [5 if x > 1 else x for x in place]
+        unit = _radians(table.titles[i]) if len(names) == 1 else 1.0
+        cells[place[0], place[-1]] = (table.rows[:, i] * unit) ** (2 if found["sigma"] else 1)
+        if {"roll", "pitch"} & {*names}:
+            axes = {"error": "split", "axes": "rpy"}
+        axes = _ROS if found["cov"] and not names else axes
+    cells.pop((6, 6), None)
+    if not {(i, i) for i in range(3 - flat)} <= cells.keys():
+        return None, NOTHING, ()
+    P = symmetric(np.column_stack([*cells.values()]), [*cells])
+    table.check(without_part(P), "a covariance of finite numbers")
+    for i in {*range(6)} - {i for i, j in cells if i == j}:
+        P[:, i, i] = -1.0
+    if flat:
+        return P[:, [[0], [1], [5]], [0, 1, 5]], _ROS, ()
+    column = table.titles.index("est_err_type") if "est_err_type" in table.titles else -1
+    kinds = {*table.words.get(column, ())}
     if len(kinds) > 1 or not kinds <= _ERRORS.keys():
         raise ValueError(
             f"{table.path}: est_err_type is {', '.join(sorted(kinds))}; expected one of "
             f"{', '.join(_ERRORS)} in all lines"
         )
-    return P, _ERRORS[kinds.pop()] if kinds else MIXED
+    if kinds:
+        return P, _ERRORS[kinds.pop()], ()
+    taken = ", ".join(axes.values())
+    note = f"its titles do not say of which error its covariances are: taken as {taken}"
+    return P, axes, (note,)
+
+
+def _places(told: Sequence[str]) -> list[list[int]]:
+    """The places of the numbers of a covariance: of all, or of the upper triangle, row by row; or
+    by the two digits of each."""
+    size = {36: 6, 21: 6, 9: 3, 6: 3}.get(len(told), 0)
+    places = np.argwhere(np.tri(size, k=size * (len(told) == size**2)).T)
+    if any(len(x) > 1 for x in told) and all(len(x.replace("_", "")) == 2 for x in told):
+        places = np.array([[int(x[0]), int(x[-1])] for x in told])
+        places -= places.min()
+    return places.tolist()

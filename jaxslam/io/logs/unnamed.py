@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam._runtime.files import LARGEST
-from jaxslam.io.logs.log import MIXED, Log, log, planar, symmetric
+from jaxslam.io.logs.log import MIXED, NOTHING, Log, log, planar, symmetric
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, transforms
 
@@ -24,9 +24,20 @@ def _of(columns: int, read: Callable[[Table], Log]) -> Reader:
     return lambda table: read(table) if table.rows.shape[1] == columns else None
 
 
+_BEHIND = {
+    8: [], 20: [*((3 + i, 3 + j) for i, j in UPPER), *UPPER],
+    29: np.argwhere(np.tri(6).T), 44: [*np.ndindex(6, 6)],
+}  # fmt: skip
+"""The places of the numbers of a covariance, behind those of a pose: none; of OpenVINS, of rotation
+and position; an upper triangle; all."""
+
+
 def _tum(table: Table) -> Log:
-    _finite_or_none(table, EXPECTED)
-    return log(table, table.rows)
+    count = table.rows.shape[1]
+    more = "" if count == 8 else f", and {count - 8} of a covariance"
+    rows = _finite_or_none(table, f"{EXPECTED}{more}")
+    P = symmetric(rows[:, 8:], _BEHIND[count]) if more else None
+    return log(table, rows[:, :8], P, MIXED if count == 20 else NOTHING)
 
 
 def _planar(table: Table) -> Log:
@@ -60,14 +71,6 @@ def _kitti(table: Table) -> Log:
     return Log(seconds, T, np.empty((0, 6, 6)))
 
 
-def _pose_to_file(table: Table) -> Log:
-    expected = "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS)"
-    rows = _finite_or_none(table, expected)
-    places = [(3 + i, 3 + j) for i, j in UPPER] + UPPER
-    P = symmetric(rows[:, 8:], places)
-    return log(table, rows[:, :8], P, MIXED)
-
-
 def _state(table: Table) -> Log | None:
     """A line of OpenVINS's states: `t q p …`, whose quaternions of JPL have the numbers of
     Hamilton's, of the body in the world; for each of n cameras 15 numbers more, and 30 of the IMU.
@@ -95,12 +98,13 @@ def _of_cameras(count: np.ndarray, each: int, more: tuple[int, ...]) -> tuple[in
 
 
 def _w_first(table: Table) -> Log | None:
-    """Lines `t p q …` with w first, of EuRoC (17 numbers) and of VINS-Mono (11)."""
+    """Lines `t p q …` with w first, of EuRoC (17 numbers) and of VINS-Mono (11, or 8 in ns between
+    commas; between spaces they are those of ORB-SLAM3, with w last)."""
     count = table.rows.shape[1]
     if count not in (8, 11, 17) or np.abs(table.rows[:, 4:8]).max() > 2:
         return None
     unit = np.abs(np.linalg.norm(table.rows[:, 4:8], axis=1) - 1) < _LENGTH
-    if not unit.all() or (count == 8 and table.rows[0, 0] < 1e17):
+    if not unit.all() or (count == 8 and (table.rows[0, 0] < 1e17 or table.separator is None)):
         return None
     found = log(table, table.rows[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     note = f"{table.path}: {count} columns are taken as t p q …, with w first (EuRoC, VINS-Mono)"
@@ -133,5 +137,7 @@ FORMATS: tuple[tuple[str, Reader], ...] = (
     ("KITTI, 12 numbers", _of(12, _kitti)),
     ("t x y z and a triangle, 10 numbers", _of(10, _positions)),
     ("OpenVINS's states", _state),
-    ("OpenVINS's pose_to_file, 20 numbers", _of(20, _pose_to_file)),
+    ("OpenVINS's pose_to_file, 20 numbers", _of(20, _tum)),
+    ("TUM and a triangle, 29 numbers", _of(29, _tum)),
+    ("TUM and a covariance, 44 numbers", _of(44, _tum)),
 )
