@@ -131,8 +131,8 @@ def _film(name: str, film: dict[str, Any]) -> list[str]:
     """The numbers of a film; of one whose unit is never fixed there are no NEES."""
     nees, lost = film.get("beyond_scale", np.nan), film["frames"] - film["tracked"]
     shares = [film["error"], *(film.get(f"inside{x}", np.nan) for x in SETS)]
-    numbers = [*(f"{100 * x:.2g} %" for x in shares), f"{nees:.2g}", f"{nees**0.5:.2g}"]
-    last = f"{100 * film.get('lies', np.nan):.2g} %", f"{film.get('drift', np.nan):.2g} σ"
+    numbers = [*(f"{100 * x:.3g} %" for x in shares), f"{nees:.2g}", f"{nees**0.5:.2g}"]
+    last = f"{100 * film.get('lies', np.nan):.3g} %", f"{film.get('drift', np.nan):.2g} σ"
     cells = [f"{lost:.0f} of {film['frames']:.0f}", *numbers, *last]
     return [name, *("–" if "nan" in cell else cell for cell in cells)]
 
