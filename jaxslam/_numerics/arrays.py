@@ -101,8 +101,8 @@ def check_numbers(what: str, value: Any, least: str = "") -> None:
 
     Words, pieces, and numbers that are being traced are let through.
     """
-    if isinstance(value, tuple | int | float | np.ndarray):
-        for number in np.ravel(value).tolist():
+    for one in jax.tree.leaves(value) if isinstance(value, tuple) else (value,):
+        for number in np.ravel(one).tolist() if isinstance(one, int | float | np.ndarray) else ():
             if not np.isfinite(number):
                 raise ValueError(f"{what} holds {number}; it must be finite")
             if least and (number < 0 or (least == "positive" and not number)):
