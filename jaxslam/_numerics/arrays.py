@@ -6,6 +6,7 @@ A module's leaves are NumPy's float64 or arrays of JAX's, so that a filter made 
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -103,7 +104,7 @@ def check_numbers(what: str, value: Any, least: str = "") -> None:
     """
     for one in jax.tree.leaves(value) if isinstance(value, tuple) else (value,):
         for number in np.ravel(one).tolist() if isinstance(one, int | float | np.ndarray) else ():
-            if not np.isfinite(number):
+            if not math.isfinite(number):
                 raise ValueError(f"{what} holds {number}; it must be finite")
             if least and (number < 0 or (least == "positive" and not number)):
                 wanted = "be positive" if least == "positive" else "not be negative"
