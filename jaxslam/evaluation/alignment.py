@@ -363,9 +363,9 @@ def _by_first(run: Poses, how: str) -> tuple[Similarity, Squares, Float[np.ndarr
     The error of that pose moves all others; where its σ is not small, its covariance is added to
     theirs as if both were independent.
     """
-    P, n, most = run.covariances.copy(), run.truths.shape[-1] - 1, np.ones(len(run.estimates))
-    if how != BY_FIRST and run.joint is None:
-        moved = _moved_by_first(run)
+    P, n, most = run.covariances, run.truths.shape[-1] - 1, np.ones(len(run.estimates))
+    if how == BY_ANY or (how != BY_FIRST and run.joint is None):
+        P, moved = P.copy(), _moved_by_first(run)
         P[1:] += (how == BY_ANY) * moved[1:]
         most = most_nees(run.covariances, moved, P, run.axes)
     R = (run.truths[0] @ np.linalg.inv(run.estimates[0]))[:n, :n]

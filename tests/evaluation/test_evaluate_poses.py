@@ -768,3 +768,12 @@ def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     common = M[:, 1] @ S @ np.swapaxes(M[:, 2], 1, 2)
     np.testing.assert_allclose(blocks[:, 1, :, 2], common, rtol=1e-9, atol=1e-15)
     assert joint[0, 0, 0] == P[0, 0, 0, 0]
+
+
+def test_the_first_covariance_is_added_to_the_others_where_they_are_joint_too():
+    T, P, true = logged(SPLIT, runs=3, steps=5)
+    one, other = (
+        jaxslam.evaluate_poses(T, given, true, SPLIT, align="first")
+        for given in (P, np.stack([diagonal(run) for run in P]))
+    )
+    np.testing.assert_allclose(one.mean, other.mean)
