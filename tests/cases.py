@@ -18,6 +18,7 @@ import pytest
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.slam import Slam
+from jaxslam.filters.window.record import Record
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
 from jaxslam.landmarks import LANDMARKS
@@ -242,3 +243,11 @@ class Around(AbstractStaged):
 
     def in_map(self, state):
         return self.estimator.in_map(state["inside"])
+
+
+def whole_record(controls, measured, seen, first):
+    """The record of a window whose frames all moved and whose noise is alike."""
+    steps = len(seen) - 1
+    ones, no = jnp.ones(steps, measured.dtype), jnp.zeros(steps, bool)
+    moved, alike = jnp.zeros((), bool), jnp.ones(seen.shape, measured.dtype)
+    return Record(jnp.asarray(steps), controls, ones, no, moved, measured, alike, seen, first)

@@ -53,6 +53,12 @@ class Features(eqx.Module):
     """κ of each: its noise in an update is κ R, R the sensor's, as where a patch fits badly; None
     is 1."""
 
+    @property
+    def factors(self) -> Float[Array, "*frames m"]:
+        """Every κ."""
+        factors = 1.0 if self.noise_factor is None else self.noise_factor
+        return jnp.broadcast_to(jnp.asarray(factors, self.measured.dtype), self.valid.shape)
+
     def places(self, count: int) -> Int[Array, "*frames m"]:
         """The slots, and `count`, which is out of bounds, for what is not valid."""
         return jnp.where(self.valid, self.slots, count)

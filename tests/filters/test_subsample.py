@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import quick_jit, whole_record
 
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
-from jaxslam.filters.window.record import whole
 from jaxslam.filters.window.subsample import Coarse, every, thinned, tied
 from jaxslam.filters.words import scenario_pieces
 from jaxslam.landmarks import InverseScaling
@@ -34,7 +33,7 @@ def full(frames=FRAMES):
     k = jnp.arange(frames)[:, None]
     seen = jnp.concatenate([k >= 0, k >= 1, k == 3, k < 0], axis=1)
     measured = jnp.where(seen[..., None], 100.0 * k[..., None] + jnp.arange(2.0), 0.0)
-    return whole(jnp.full(frames - 1, 0.1), measured, seen, jnp.array([0, 1, 3, 0]))
+    return whole_record(jnp.full(frames - 1, 0.1), measured, seen, jnp.array([0, 1, 3, 0]))
 
 
 fewer_of = quick_jit(thinned)
@@ -133,7 +132,7 @@ def test_a_window_is_tied_while_frames_that_stay_share_half_of_their_landmarks(l
     k, j = jnp.arange(FRAMES)[:, None], jnp.arange(2 * FRAMES) - FRAMES
     seen = (j <= k) & (k < j + lives)
     measured, first = jnp.zeros((*seen.shape, 2)), jnp.maximum(j, 0)
-    record = whole(jnp.full(FRAMES - 1, 0.1), measured, seen, first)
+    record = whole_record(jnp.full(FRAMES - 1, 0.1), measured, seen, first)
     are_tied = quick_jit(tied)
     assert bool(are_tied(record)) == holds
     record = full()  # and a frame without light unties nothing

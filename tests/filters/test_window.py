@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import close, quick_jit
+from cases import close, quick_jit, whole_record
 from scipy.stats import chi2, norm
 
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
 from jaxslam.filters.window.problem import PathLayout, left_out, path, reduced, residuals
-from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
+from jaxslam.filters.window.record import Record, begun, empty, removed, stepped
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
 from jaxslam.filters.window.to_filter import _with_metre, gauge_state
 from jaxslam.filters.words import scenario_pieces
@@ -68,11 +68,13 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
     seen = (jnp.arange(FRAMES)[:, None] >= FIRST) & (jnp.arange(FRAMES)[:, None] <= last)
     first = jnp.asarray(draw.uniform(150, 450, (m, p)))
     seen = seen.at[2, 1].set(False)
-    record = whole(jnp.full(FRAMES - 1, 1 / 5), jnp.tile(first, (FRAMES, 1, 1)), seen, FIRST)
-    record = replace(record, last=jnp.asarray(last))
+    record = whole_record(jnp.full(FRAMES - 1, 1 / 5), jnp.tile(first, (FRAMES, 1, 1)), seen, FIRST)
+    factor = jnp.asarray(np.exp(np.random.default_rng(8).uniform(-1, 1, seen.shape)))
+    record = replace(record, last=jnp.asarray(last), noise_factor=factor)
     wrong = quick_jit(residuals)(slam, record, quick_jit(path)(slam, record, x), y)
     noise = jnp.where(record.compared[..., None], draw.standard_normal(wrong.shape), 0.0)
-    measured = record.measured - slam.sensor.sigma * (wrong - noise)
+    sigma = slam.sensor.sigma * jnp.sqrt(factor)[..., None]
+    measured = record.measured - sigma * (wrong - noise)
     return Case(slam, replace(record, measured=measured), x, y)
 
 
@@ -123,9 +125,10 @@ def minimum(*of):
     return precisely(*case(*of))
 
 
-def features(slots, measured, valid=None):
+def features(slots, measured, valid=None, factor=None):
     valid = np.ones(len(slots), bool) if valid is None else valid
-    return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid))
+    factor = None if factor is None else jnp.array(factor)
+    return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid), factor)
 
 
 @quick_jit
@@ -135,7 +138,7 @@ def some_record():
     record = begun(record, features([1, 0, 2], [11.0, 10.0, 99.0], [True, True, False]))
     record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]), jnp.eye(1))
     record = begun(record, features([2], [22.0]))
-    seen = features([2, 0], [32.0, 30.0], [True, False])
+    seen = features([2, 0], [32.0, 30.0], [True, False], [4.0, 9.0])
     return stepped(record, jnp.asarray(0.2), seen, jnp.eye(1))
 
 
@@ -149,6 +152,8 @@ def test_a_record_has_every_measurement_by_frame_and_slot():
     np.testing.assert_array_equal(record.seen, seen)
     expected = [[10, 11, 0], [20, 21, 22], [0, 0, 32]]
     np.testing.assert_array_equal(record.measured[..., 0], expected)
+    factors = [[1, 1, 1], [1, 1, 1], [1, 1, 4]]
+    np.testing.assert_array_equal(record.noise_factor, factors)
     compared = [[False] * 3, [True, True, False], [False, False, True]]
     np.testing.assert_array_equal(record.compared, compared)
 
@@ -210,6 +215,27 @@ def test_while_nothing_moves_the_newest_frame_takes_the_place_of_the_one_before(
     for record in (moved, after):
         np.testing.assert_array_equal(record.restarted, [False, True, False])
     assert not unseen.standing
+
+
+def test_a_measurement_has_its_own_noise():
+    """Its residual is so much smaller; so is what its landmark's own numbers do, where it is the
+    first; and pixels that are as uncertain as they have moved may stand."""
+    slam, record, x, y = case(*SPACE)
+    other = replace(record, noise_factor=record.noise_factor.at[3, 0].multiply(4.0))
+    other = replace(other, noise_factor=other.noise_factor.at[FIRST[2], 2].multiply(4.0))
+
+    @quick_jit
+    def both(record, y):
+        return residuals(slam, record, path(slam, record, x), y)
+
+    p = slam.sensor.size
+    expected = both(record, y.at[2, :p].multiply(2.0)).at[3, 0].divide(2.0)
+    np.testing.assert_allclose(both(other, y), expected, rtol=1e-9, atol=1e-9)
+    (first, *_), _ = standing_then_moving()
+    moved = [19.0, 21.0]
+    for factor, stands in (None, False), ([100.0, 1.0], True):
+        seen = features([0, 1], moved, factor=factor)
+        assert stepped(first, jnp.asarray(0.1), seen, jnp.eye(1)).standing == stands
 
 
 def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
@@ -392,18 +418,19 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(monkeypatch):
         """Of the landmarks in the newest camera: bearing and inverse depth."""
         newest = jax.tree.map(lambda leaf: leaf[record.last], there.frames.pose)
 
-        def one(first, measured, y):
+        def one(first, measured, factor, y):
             begun = jax.tree.map(lambda leaf: leaf[first], there.frames)
             T = newest.inverse() @ begun.pose
             sensor = slam.calibration.sensor(slam.sensor, begun.calibration)
             depth = slam.depth
             common = 0.0 if depth.common is None else depth.common * there.common[0]
             omega = depth.mean + depth.sigma * (y[p:] + common)
-            X, omega = sensor.locate(measured + sensor.sigma * y[:p], omega)
+            X, omega = sensor.locate(measured + jnp.sqrt(factor) * sensor.sigma * y[:p], omega)
             X = T.rotation() @ X + T.translation() * omega
             return jnp.append(X, omega) / X[-1]
 
-        return jax.vmap(one)(FIRST, record.measured[FIRST, jnp.arange(m)], y)
+        firsts = FIRST, jnp.arange(m)
+        return jax.vmap(one)(FIRST, record.measured[firsts], record.noise_factor[firsts], y)
 
     state, (pose, covariance), (points, spread) = handed(at)
     u = jnp.append(at.x, at.y.ravel())

@@ -126,12 +126,11 @@ class RaySum(AbstractDelayed):
 
     def _of_members(self, features: Features, share: Float[Array, "m members"]) -> Features:
         """The same measurement for each of a landmark's members, for a share ρ with noise R/ρ."""
-        own = 1.0 if features.noise_factor is None else features.noise_factor[:, None]
         return Features(
             self._slots_of(features).ravel(),
             jnp.repeat(features.measured, self.slots_each, axis=0),
             (features.valid[:, None] & (share > 0)).ravel(),
-            (own / jnp.where(share > 0, share, 1.0)).ravel(),
+            (features.factors[:, None] / jnp.where(share > 0, share, 1.0)).ravel(),
         )
 
 

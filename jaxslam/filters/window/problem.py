@@ -139,11 +139,12 @@ def located(
     calibration: Float[Array, " k"],
     common: Float[Array, " c"],
     measured: Float[Array, " p"],
+    noise_factor: Scalar,
     y: Float[Array, " q"],
 ) -> tuple[Float[Array, " n"], Scalar]:
     """The homogeneous point of a landmark, in the camera of the frame that first measured it."""
     sensor, p = slam.model.sensor_at(calibration), measured.size
-    pixel = measured + cholesky(sensor.noise).root @ y[:p]
+    pixel = measured + jnp.sqrt(noise_factor) * (cholesky(sensor.noise).root @ y[:p])
     return sensor.locate(pixel, hidden(slam, common, y[p:]))
 
 
@@ -175,16 +176,16 @@ def sights(slam: AbstractSlam, record: Record, at: Path, y: Y) -> Sight:
     """The sights of all landmarks, from the frames in which they were first seen."""
     calibrations = at.frames.calibration[record.first]
 
-    def one(measured, calibration, y):
+    def one(measured, noise_factor, calibration, y):
         def of(calibration, common, y):
-            return jnp.append(*located(slam, calibration, common, measured, y))
+            return jnp.append(*located(slam, calibration, common, measured, noise_factor, y))
 
         arguments = calibration, at.common, y
         there = of(*arguments)
         slopes = jax.jacfwd(of, argnums=(0, 1, 2))(*arguments)
         return Sight(there[:-1], there[-1], _by_motion(slam, there[:-1], there[-1]), *slopes)
 
-    return jax.vmap(one)(record.first_measured, calibrations, y)
+    return jax.vmap(one)(*record.begun_by, calibrations, y)
 
 
 def _by_motion(slam: AbstractSlam, point: Float[Array, " n"], omega: Scalar) -> Array:
@@ -234,22 +235,22 @@ def _compared(slam: AbstractSlam, record: Record, at: Path, y: Y) -> tuple[Sight
 def _seen(slam: AbstractSlam, record: Record, at: Path, relative, sight: Sight) -> Seen:
     whitening = cholesky(slam.sensor.noise).whitening
 
-    def one(T, calibration, point, omega, measured):
+    def one(T, calibration, point, omega, measured, noise_factor):
         here = jnp.append(T @ jnp.append(point, omega), omega)
 
         def wrong(here, calibration):
             sensor = slam.model.sensor_at(calibration)
             predicted = sensor.measure(here[:-1], here[-1])
-            return whitening @ sensor.residual(measured, predicted)
+            return whitening @ sensor.residual(measured, predicted) / jnp.sqrt(noise_factor)
 
         slopes = jax.jacfwd(wrong, argnums=(0, 1))(here, calibration)
         impossible = ~slam.model.sensor_at(calibration).possible(here[:-1])
         return Seen(wrong(here, calibration), impossible, *slopes, here)
 
-    of_frame = jax.vmap(one, in_axes=(0, None, 0, 0, 0))
-    found = jax.vmap(of_frame, in_axes=(0, 0, None, None, 0))(
-        relative, at.frames.calibration, sight.point, sight.omega, record.measured
-    )
+    of_frame = jax.vmap(one, in_axes=(0, None, 0, 0, 0, 0))
+    of_all = jax.vmap(of_frame, in_axes=(0, 0, None, None, 0, 0))
+    measured = record.measured, record.noise_factor
+    found = of_all(relative, at.frames.calibration, sight.point, sight.omega, *measured)
     used = record.compared
 
     def masked(x):

@@ -39,6 +39,8 @@ class Record(eqx.Module):
     """Whether nothing has moved since frame 0."""
     measured: Float[Array, "F m p"]
     """By slot of the landmark."""
+    noise_factor: Float[Array, "F m"]
+    """Of each, as of `Features`."""
     seen: Bool[Array, "F m"]
     first: Int[Array, " m"]
     """The frame in which a slot's landmark was first seen."""
@@ -65,22 +67,18 @@ class Record(eqx.Module):
         return self.seen & (k > self.first) & (k <= self.last)
 
     @property
-    def first_measured(self) -> Float[Array, "m p"]:
-        """The first measurement of every slot's landmark."""
-        return self.measured[self.first, jnp.arange(self.first.size)]
+    def begun_by(self) -> tuple[Float[Array, "m p"], Float[Array, " m"]]:
+        """The first measurement of every slot's landmark, and its noise factor."""
+        of_first = self.first, jnp.arange(self.first.size)
+        return self.measured[of_first], self.noise_factor[of_first]
 
     def cut(self, frames: int) -> Record:
         """The first frames alone, for a smaller problem."""
-        return Record(
-            jnp.minimum(self.last, frames - 1),
-            jax.tree.map(lambda x: x[: frames - 1], self.controls),
-            self.merged[: frames - 1],
-            self.restarted[: frames - 1],
-            self.standing,
-            self.measured[:frames],
-            self.seen[:frames],
-            self.first,
-        )
+        steps = self.controls, self.merged, self.restarted
+        steps = jax.tree.map(lambda x: x[: frames - 1], steps)
+        measured = (x[:frames] for x in (self.measured, self.noise_factor, self.seen))
+        last = jnp.minimum(self.last, frames - 1)
+        return Record(last, *steps, self.standing, *measured, self.first)
 
 
 def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: DTypeLike) -> Record:
@@ -93,22 +91,10 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: DT
         jnp.zeros(frames - 1, bool),
         jnp.ones((), bool),
         jnp.zeros((frames, landmarks, p), dtype),
+        jnp.ones((frames, landmarks), dtype),
         jnp.zeros((frames, landmarks), bool),
         jnp.zeros(landmarks, int),
     )
-
-
-def whole(
-    controls: Control,
-    measured: Float[Array, "F m p"],
-    seen: Bool[Array, "F m"],
-    first: Int[Array, " m"],
-) -> Record:
-    """A full record of frames that all moved."""
-    steps = len(seen) - 1
-    ones, no = jnp.ones(steps, measured.dtype), jnp.zeros(steps, bool)
-    moved = jnp.zeros((), bool)
-    return Record(jnp.asarray(steps), controls, ones, no, moved, measured, seen, first)
 
 
 def stepped(record: Record, control: Control, seen: Features, noise: Float[Array, "p p"]) -> Record:
@@ -132,10 +118,11 @@ def stepped(record: Record, control: Control, seen: Features, noise: Float[Array
 
 def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[Array, ""]:
     """Whether all that is seen, and that is something, is where it was first seen."""
-    moved = seen.measured - record.first_measured[seen.slots]
-    whitened = moved @ cholesky(2 * noise).whitening.T
-    squared = jnp.sum(jnp.where(seen.valid[:, None], whitened, 0.0) ** 2)
-    dof = jnp.sum(seen.valid) * moved.shape[1]
+    first, factor = (x[seen.slots] for x in record.begun_by)
+    whitened = (seen.measured - first) @ cholesky(noise).whitening.T
+    factor = factor + seen.factors
+    squared = jnp.sum(jnp.where(seen.valid, jnp.sum(whitened**2, axis=1) / factor, 0.0))
+    dof = jnp.sum(seen.valid) * first.shape[1]
     return (dof > 0) & (squared <= dof + STILL * jnp.sqrt(2 * dof))
 
 
@@ -160,5 +147,6 @@ def _measured(record: Record, k: Int[Array, ""], features: Features) -> Record:
     return replace(
         record,
         measured=record.measured.at[k, slots].set(features.measured, mode="drop"),
+        noise_factor=record.noise_factor.at[k, slots].set(features.factors, mode="drop"),
         seen=record.seen.at[k, slots].set(True, mode="drop"),
     )

@@ -130,6 +130,7 @@ def _fewer(record: Record, kept: Kept) -> Record:
         _sums(record.restarted.astype(int), kept) > 0,
         record.standing,
         record.measured[kept.frames],
+        record.noise_factor[kept.frames],
         seen,
         jnp.argmax(seen, axis=0).astype(record.first.dtype),
     )

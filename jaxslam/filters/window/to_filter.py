@@ -106,7 +106,7 @@ def _landmark_rows(
     def one(first, of_first, measured, y, coupling):
         def of(everything):
             newest, first, y, log_scale = everything
-            return _landmark(slam, newest, first, y, measured, log_scale)
+            return _landmark(slam, newest, first, y, *measured, log_scale)
 
         everything = newest, first, y, zero
         J = jacobian(of, everything)
@@ -116,7 +116,7 @@ def _landmark_rows(
         return of(everything), rows + unit * scale.x, by_y, unit[:, 0]
 
     values, rows, by_own, units = jax.vmap(one)(
-        firsts, of_firsts, record.first_measured, at.y, local.coupling
+        firsts, of_firsts, record.begun_by, at.y, local.coupling
     )
     return values, Rows(rows, units), by_own
 
@@ -166,10 +166,10 @@ def _core(slam: AbstractSlam, like, newest, log_scale):
     )
 
 
-def _landmark(slam: AbstractSlam, newest, first, y, measured, log_scale):
+def _landmark(slam: AbstractSlam, newest, first, y, measured, noise_factor, log_scale):
     """The landmark in the map frame of the newest camera, in units of e^λ m."""
     frame, _, common = newest
-    seen, omega = located(slam, first.calibration, common, measured, y)
+    seen, omega = located(slam, first.calibration, common, measured, noise_factor, y)
     unit = jnp.exp(-log_scale[0])
     held = slam.frame.from_base_pose(scaled(frame.pose, unit))
     T_AC = slam.frame.map_from_camera(held, identity(slam.motion.geometry, y.dtype))
