@@ -43,6 +43,9 @@ less likely than `BY_CHANCE`."""
 MOST = 2 / 3
 """The share of the proven landmarks searched that must agree before a frame after such a one is
 believed."""
+MISFIT = (0.7 / 6) ** 2
+"""The variance from which on a window fits badly if it is also four times the median, pixels²: of
+first matches that do, a quarter were more than 2 pixels off, of others 1 % (docs/sequences.md)."""
 JERK = 4.0
 """σ of the accelerations of a camera that is jerked, in that of others: motions have tails."""
 LIVELY = 20.0
@@ -130,6 +133,8 @@ class Policy:
             chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches))
         agreed, variances = only(matches, chosen).first_of_each(rows)
         believed = np.isfinite(agreed[:, 0])
+        fits = variances <= max(MISFIT, 4 * np.median(variances[believed] if chosen.size else 0))
+        believed &= fits | np.array([landmarks[slot].found > 0 for slot in seen.slots], bool)
         if believed.sum() < least:
             believed[:] = False
         labels[believed] = "matched"

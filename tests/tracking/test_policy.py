@@ -41,17 +41,17 @@ def table(sigma=2.0):
     return Observations(SLOTS, PLACES, covariances, nowhere, np.zeros(COUNT), labels)
 
 
-def agreeing(found, agreeing, lost=False, sigma=2.0):
+def agreeing(found, agreeing, lost=False, sigma=2.0, variances=0.0, landmarks=LANDMARKS):
     """Of landmarks found a pixel aside, those agree whose rows are told."""
     owner = np.array(found, int)
-    scores, variances = np.ones(len(owner), np.float32), np.zeros(len(owner))
+    scores, variances = np.ones(len(owner), np.float32), np.resize(variances, len(owner))
     matches = Matches(owner, PLACES[owner] + ASIDE, scores, variances)
 
     def agree(slots, those):
         assert those is matches
         return np.isin(slots, SLOTS[list(agreeing)])
 
-    return POLICY.agreeing(table(sigma), matches, LANDMARKS, agree, lost=lost)
+    return POLICY.agreeing(table(sigma), matches, landmarks, agree, lost=lost)
 
 
 def test_what_agrees_is_matched_and_the_rest_of_what_was_found_is_an_outlier():
@@ -61,6 +61,20 @@ def test_what_agrees_is_matched_and_the_rest_of_what_was_found_is_an_outlier():
     assert np.isnan(seen.pixels[12:]).all()
     assert np.isnan(seen.believed[8:]).all()
     np.testing.assert_array_equal(seen.places, np.where(seen.matched[:, None], seen.pixels, PLACES))
+
+
+@pytest.mark.parametrize(
+    ("others", "own", "first", "believed"),
+    [(1e-4, 0.0135, 0, True), (1e-4, 0.0137, 0, False), (1e-4, 0.0137, 1, True),
+     (0.01, 0.0399, 0, True), (0.01, 0.0401, 0, False)],
+)  # fmt: skip
+def test_a_landmark_is_first_matched_where_its_window_fits(others, own, first, believed):
+    """By σ of .7 px with the factor of 6, or by that of twice the median where all fit badly."""
+    landmarks = LANDMARKS | {SLOTS[0]: replace(LANDMARKS[SLOTS[0]], found=first)}
+    variances = np.append(own, np.full(7, others))
+    seen = agreeing(range(8), range(8), variances=variances, landmarks=landmarks)
+    assert seen.labels[0] == ("matched" if believed else "outlier")
+    assert seen.matched[1:8].all()
 
 
 def test_fewer_than_chance_would_give_are_not_believed_and_a_lost_camera_needs_more():
