@@ -246,6 +246,8 @@ from jax._src import xla_bridge
 assert not xla_bridge.backends_are_initialized()
 import jaxslam.cli.commands
 assert not {"cv2", "evo"} & set(sys.modules)
+import jaxslam.tracking.video
+assert "rerun" not in sys.modules  # which only a recording needs
 """
     ended = ended_of(code)
     assert (ended.returncode, ended.stderr) == (0, "")
