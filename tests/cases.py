@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.readouts import camera_pose
@@ -29,8 +30,8 @@ from jaxslam.simulation import Room, features, scenario, sightings, simulate
 
 each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())
-few_landmarks = [LANDMARKS[name] for name in ("inverse_scaling", "inverse_depth", "cartesian")]
-"""Where every parametrization would cost minutes: homogeneous, anchored with angles, plain."""
+FALSE_ALARM = 1e-6
+"""Share of seeds on which a statistical test would fail although nothing is wrong."""
 
 
 def quick_rows(count, rows):
@@ -38,6 +39,18 @@ def quick_rows(count, rows):
     theirs alone."""
     others = (x if type(x) is tuple else (x,) for x in rows[count:])
     return [*rows[:count], *(pytest.param(*x, marks=pytest.mark.slow) for x in others)]
+
+
+def standard_normal(numbers):
+    """Have independent numbers the variance and the mean of standard normal ones, but for
+    FALSE_ALARM?"""
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], numbers.size)
+    assert low < np.sum(np.square(numbers)) < high
+    centred(numbers)
+
+
+def centred(numbers):
+    assert abs(numbers.mean()) * np.sqrt(numbers.size) < stats.norm.isf(FALSE_ALARM / 2)
 
 
 def named(value):

@@ -549,8 +549,7 @@ LOGS = {
     "TUM": Log(tum),
     "TUM, of the tracker": Log(lambda x: tum(x, "trajectory.txt", truth="groundtruth.txt")),
     "TUM, named by options": Log(
-        lambda x: tum(x, "mine.csv", "sigma.txt", "mocap.csv"),
-        source="mine.csv",
+        lambda x: tum(x, "mine.csv", "sigma.txt", "mocap.csv"), source="mine.csv",
         beside={"covariance": "sigma.txt", "truth": "mocap.csv"},
     ),
     "TUM, all of a covariance": Log(tum_and(P)),
@@ -566,111 +565,71 @@ LOGS = {
     "TUM, tabs": Log(rewritten(lambda _, row: "\t".join(row))),
     "TUM, quotes": Log(rewritten(lambda _, row: ",".join(f'"{x}"' for x in row))),
     "TUM, a comma at the end": Log(rewritten(lambda _, row: ",".join(row) + ",")),
-    "TUM, an index of pandas": Log(
-        rewritten(
-            lambda i, row: ",".join([str(i), *row]),
-            title=lambda count: "".join(f",{i}" for i in "abcdefghijklmnopqrstuv"[:count]),
-        )
-    ),
-    "TUM, w first and nanoseconds": Log(
-        trajectories("t x y z qw qx qy qz", between=",", nanoseconds=True)
-    ),
-    "titles in another order": Log(
-        trajectories(
-            "qw qz qx qy z status y x t",
-            "q_w,q_z,q_x,q_y,pos_z [m],status,pos_y [m],pos_x [m],timestamp [s]\n",
-        )
-    ),
-    "titles of ROS' CSV": Log(
-        trajectories(
-            "seq x y z qx qy qz qw t",
-            "%seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
-            "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,"
-            "field.pose.orientation.w,field.header.stamp\n",
-            nanoseconds=True,
-        )
-    ),
-    "titles of EuRoC": Log(
-        trajectories(
-            "t x y z qw qx qy qz v v v",
-            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
-            "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]\n",
-            nanoseconds=True,
-        ),
-        spare=True,
-    ),
+    "TUM, an index of pandas": Log(rewritten(
+        lambda i, row: ",".join([str(i), *row]),
+        title=lambda count: "".join(f",{i}" for i in "abcdefghijklmnopqrstuv"[:count]),
+    )),
+    "TUM, w first and nanoseconds": Log(trajectories("t x y z qw qx qy qz", nanoseconds=True)),
+    "titles in another order": Log(trajectories(
+        "qw qz qx qy z status y x t",
+        "q_w,q_z,q_x,q_y,pos_z [m],status,pos_y [m],pos_x [m],timestamp [s]\n",
+    )),
+    "titles of ROS' CSV": Log(trajectories(
+        "seq x y z qx qy qz qw t",
+        "%seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+        "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,"
+        "field.pose.orientation.w,field.header.stamp\n", nanoseconds=True,
+    )),
+    "titles of EuRoC": Log(trajectories(
+        "t x y z qw qx qy qz v v v",
+        "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+        "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]\n",
+        nanoseconds=True,
+    ), spare=True),
     "w first, 17 numbers": Log(
-        trajectories("t x y z qw qx qy qz" + 9 * " v", between=" "), spare=True
-    ),
+        trajectories("t x y z qw qx qy qz" + 9 * " v", between=" "), spare=True),
     "TUM, dates": Log(rewritten(dated)),
     "TUM, nanoseconds of ORB-SLAM3": Log(
-        trajectories("t x y z qx qy qz qw", between=" ", nanoseconds=True, ending="txt")
-    ),
-    "TUM, variances by titles": Log(
-        tum_and(SIGMA[:, ::-1] ** 2, "# t var_rz var_ry var_rx pos_var_z pos_var_y pos_var_x\n"),
-        OF_SIGMAS,
-    ),
+        trajectories("t x y z qx qy qz qw", between=" ", nanoseconds=True, ending="txt")),
+    "TUM, variances by titles": Log(tum_and(
+        SIGMA[:, ::-1] ** 2, "# t var_rz var_ry var_rx pos_var_z pos_var_y pos_var_x\n"
+    ), OF_SIGMAS),
     "TUM and a triangle": Log(
         titled("", TIMES, ESTIMATE[:, :3, 3], quaternions(R), right(P)[:, *UPPER], between=" "),
-        rtol=0.02,
-        convention=Convention("right"),
+        rtol=0.02, convention=Convention("right"),
     ),
-    "titles of ROS' CSV with covariances": Log(
-        titled(
-            "%time field.header.stamp field.pose.pose.position.x field.pose.pose.position.y "
-            "field.pose.pose.position.z field.pose.pose.orientation.x "
-            "field.pose.pose.orientation.y field.pose.pose.orientation.z "
-            "field.pose.pose.orientation.w field.pose.covariance{} "
-            "field.twist.twist.linear.x field.twist.covariance{}",
-            *(1e9 * (TIMES + 0.03), 1e9 * TIMES, ESTIMATE[:, :3, 3], quaternions(R)),
-            *(in_the_world(P), np.ones((STEPS, 37))),
-        ),
-        convention=SPLIT,
-        spare=True,
-    ),
-    "titles of PlotJuggler and ROS 2": Log(
-        titled(
-            "/o/header/stamp/sec /o/header/stamp/nanosec /o/pose/pose/position/x "
-            "/o/pose/pose/position/y /o/pose/pose/position/z /o/pose/pose/orientation/w "
-            "/o/pose/pose/orientation/x /o/pose/pose/orientation/y /o/pose/pose/orientation/z "
-            + " ".join(f"/o/pose/covariance[{i};{j}]" for i, j in zip(*UPPER, strict=True)),
-            *(
-                TIMES // 1,
-                1e9 * (TIMES % 1),
-                ESTIMATE[:, :3, 3],
-                np.roll(quaternions(R), 1, axis=1),
-            ),
-            in_the_world(P)[:, *UPPER],
-        ),
-        convention=SPLIT,
-    ),
-    "titles of angles in degrees, and σ": Log(
-        titled(
-            "time pos_x pos_y pos_z roll_deg pitch_deg yaw_deg rot_std_x rot_std_y rot_std_z "
-            "std_pos_x std_pos_y std_pos_z",
-            *(TIMES, ESTIMATE[:, :3, 3]),
-            Rotation.from_matrix(R).as_euler("ZYX", degrees=True)[:, ::-1],
-            *(SIGMA[:, 3:], SIGMA[:, :3]),
-        ),
-        OF_SIGMAS,
-    ),
-    "titles in a plane, with a covariance": Log(
-        lambda x: (
-            lines(x / "truth.txt", TIMES, FLAT_TRUTH),
-            lines(
-                *(x / "estimate.csv", TIMES, FLAT, FLAT_P[:, *UPPER3]),
-                header="t,x,y,yaw,pxx,pxy,pxh,pyy,pyh,phh\n",
-                between=",",
-            ),
-        ),
-        IN_THE_PLANE,
-    ),
+    "titles of ROS' CSV with covariances": Log(titled(
+        "%time field.header.stamp field.pose.pose.position.x field.pose.pose.position.y "
+        "field.pose.pose.position.z field.pose.pose.orientation.x field.pose.pose.orientation.y "
+        "field.pose.pose.orientation.z field.pose.pose.orientation.w field.pose.covariance{} "
+        "field.twist.twist.linear.x field.twist.covariance{}",
+        1e9 * (TIMES + 0.03), 1e9 * TIMES, ESTIMATE[:, :3, 3], quaternions(R), in_the_world(P),
+        np.ones((STEPS, 37)),
+    ), convention=SPLIT, spare=True),
+    "titles of PlotJuggler and ROS 2": Log(titled(
+        "/o/header/stamp/sec /o/header/stamp/nanosec /o/pose/pose/position/x "
+        "/o/pose/pose/position/y /o/pose/pose/position/z /o/pose/pose/orientation/w "
+        "/o/pose/pose/orientation/x /o/pose/pose/orientation/y /o/pose/pose/orientation/z "
+        + " ".join(f"/o/pose/covariance[{i};{j}]" for i, j in zip(*UPPER, strict=True)),
+        TIMES // 1, 1e9 * (TIMES % 1), ESTIMATE[:, :3, 3], np.roll(quaternions(R), 1, axis=1),
+        in_the_world(P)[:, *UPPER],
+    ), convention=SPLIT),
+    "titles of angles in degrees, and σ": Log(titled(
+        "time pos_x pos_y pos_z roll_deg pitch_deg yaw_deg rot_std_x rot_std_y rot_std_z "
+        "std_pos_x std_pos_y std_pos_z",
+        TIMES, ESTIMATE[:, :3, 3],
+        Rotation.from_matrix(R).as_euler("ZYX", degrees=True)[:, ::-1], SIGMA[:, 3:], SIGMA[:, :3],
+    ), OF_SIGMAS),
+    "titles in a plane, with a covariance": Log(lambda x: (
+        lines(x / "truth.txt", TIMES, FLAT_TRUTH),
+        lines(x / "estimate.csv", TIMES, FLAT, FLAT_P[:, *UPPER3],
+              header="t,x,y,yaw,pxx,pxy,pxh,pyy,pyh,phh\n", between=","),
+    ), IN_THE_PLANE),
     "cnspy, split": Log(of_cnspy("type5", (P[:, :3, :3], P[:, 3:, 3:]))),
     # To the first order of the errors.
     "cnspy, right": Log(
         of_cnspy("type1", (right_rotation_first(P)[:, 3:, 3:], right_rotation_first(P)[:, :3, :3])),
-        rtol=0.02,
-        convention=Convention("right"),
+        rtol=0.02, convention=Convention("right"),
     ),
     "SQUARE": Log(square, rtol=0.02, convention=Convention("right", order="rotation-first")),
     "RTKLIB and NovAtel": Log(
@@ -680,41 +639,29 @@ LOGS = {
     ),
     "g2o": Log(graph),
     "TUM, column by column": Log(tum_and(P[:, *np.tril_indices(6)])),
-    "runs beside one truth": Log(
-        two_beside_one_truth,
-        partial(
-            evaluate_poses,
-            *(np.array([ESTIMATE, OTHER]), np.array([P, P]), np.array([TRUTH, TRUTH])),
-            Convention(**MIXED),
-        ),
-    ),
+    "runs beside one truth": Log(two_beside_one_truth, partial(
+        evaluate_poses, *(np.array(x) for x in ([ESTIMATE, OTHER], [P, P], [TRUTH, TRUTH])),
+        Convention(**MIXED),
+    )),
     "KITTI": Log(kitti(timed=False)),
     "KITTI, timed": Log(kitti(timed=True)),
-    **{
-        f"plane, {kind}": Log(of_planes(values), IN_THE_PLANE)
-        for kind, values in (
-            ("triangle", FLAT_P[:, *UPPER3]),
-            ("all of a covariance", FLAT_P),
-            ("σ", FLAT_SIGMA),
-        )
-    },
+    "plane, triangle": Log(of_planes(FLAT_P[:, *UPPER3]), IN_THE_PLANE),
+    "plane, all of a covariance": Log(of_planes(FLAT_P), IN_THE_PLANE),
+    "plane, σ": Log(of_planes(FLAT_SIGMA), IN_THE_PLANE),
     "npz of poses": npz_log(IN_SPACE, **POSES),
     # To the first order of the errors.
     "npz of GTSAM's marginals": npz_log(IN_SPACE, **MARGINALS)._replace(
-        rtol=0.02, convention=Convention("right", order="rotation-first")
-    ),
+        rtol=0.02, convention=Convention("right", order="rotation-first")),
     "mat of poses": Log(mat(**POSES), IN_SPACE, "runs.mat"),
     "mat of errors, cells of names": Log(
         mat(errors=ERRORS, covariances=COVARIANCES, names=np.array([*"abcd"], object)),
-        partial(OF_ERRORS, names="abcd"),
-        "runs.mat",
+        partial(OF_ERRORS, names="abcd"), "runs.mat",
     ),
     "mat of NEES": Log(mat(nees=NEES, dof=4), NEES_OF, "runs.mat"),
     "npz of errors": npz_log(OF_ERRORS, errors=ERRORS, covariances=COVARIANCES),
     "npz of σ": npz_log(OF_DEVIATIONS, errors=ERRORS, sigmas=DEVIATIONS),
     "npz of innovations": npz_log(
-        partial(OF_ERRORS, quantity="NIS"), innovations=ERRORS, covariances=COVARIANCES
-    ),
+        partial(OF_ERRORS, quantity="NIS"), innovations=ERRORS, covariances=COVARIANCES),
     "npz of NEES": npz_log(NEES_OF, nees=NEES, dof=4),
     "npz of NIS": npz_log(NIS_OF, nis=NEES, dof=4),
     **{f"CSV, n = {n}": of_n(n) for n in (1, 6)},
@@ -722,33 +669,27 @@ LOGS = {
     # Of n = 4 a full covariance is as many numbers as of n = 5 and a triangle.
     "CSV, n = 4": csv_log(OF_ERRORS, PLACES, FLAT_ERRORS, TRIANGLES),
     "CSV, all of a covariance": csv_log(
-        OF_ERRORS, PLACES, FLAT_ERRORS, COVARIANCES.reshape(-1, 16)
-    ),
+        OF_ERRORS, PLACES, FLAT_ERRORS, COVARIANCES.reshape(-1, 16)),
     "CSV, semicolons": csv_log(OF_ERRORS, PLACES, FLAT_ERRORS, TRIANGLES, between=";"),
     "CSV, σ": csv_log(
-        partial(OF_DEVIATIONS, names="abcd"),
-        *(PLACES, FLAT_ERRORS, DEVIATIONS.reshape(-1, 4)),
+        partial(OF_DEVIATIONS, names="abcd"), PLACES, FLAT_ERRORS, DEVIATIONS.reshape(-1, 4),
         header=SIGMAS_NAMED,
     ),
     "CSV, one run": csv_log(
         partial(jaxslam.evaluate, ERRORS[:1], COVARIANCES[:1], names="abcd"),
-        *(np.arange(5), ERRORS[0], TRIANGLES[:5]),
-        header=ONE_RUN,
+        np.arange(5), ERRORS[0], TRIANGLES[:5], header=ONE_RUN,
     ),
     "CSV of NEES": csv_log(NEES_OF, PLACES, *NEES_ALONE, header="run,step,nees,dof\n"),
     "CSV of NIS": csv_log(NIS_OF, PLACES, *NEES_ALONE, header="run,step,nis,dof\n"),
     **{f"bag {name}": of_bag(name) for name in KINDS},
-    **{
-        f"bag: {', '.join(kinds)}": of_bag(name, *kinds)
-        for name, *kinds in (
-            ("run.bag", "pose_with_covariance_stamped", "path"),
-            ("run.mcap", "pose_with_covariance_stamped", "odometry"),
-            ("run.bag", "odometry", "transform_stamped"),
-            ("run.mcap", "odometry", "path"),
-        )
-    },
+    **{f"bag: {', '.join(kinds)}": of_bag(name, *kinds) for name, *kinds in (
+        ("run.bag", "pose_with_covariance_stamped", "path"),
+        ("run.mcap", "pose_with_covariance_stamped", "odometry"),
+        ("run.bag", "odometry", "transform_stamped"),
+        ("run.mcap", "odometry", "path"),
+    )},
     **{
         f"bag: transforms of {name}": of_bag(name, truth="transforms", topic="/tf:map.imu")
         for name in ("run.bag", "run.mcap")
     },
-}
+}  # fmt: skip

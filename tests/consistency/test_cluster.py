@@ -14,6 +14,7 @@ import cloudpickle
 import numpy as np
 import pytest
 from journeys import case, ends
+from refusals import refused
 
 import jaxslam
 from jaxslam.consistency.cluster import on_cluster
@@ -136,11 +137,7 @@ def test_nobody_at_an_address_and_no_extra_are_said_in_one_line(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("jaxslam.consistency.cluster.ANSWER_SECONDS", 0.5)
 
-    def refused(message):
-        with pytest.raises(ValueError, match=message) as caught:
-            jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
-        assert "\n" not in str(caught.value)
-
-    refused("no Dask scheduler answers at 'tcp://127.0.0.1:9'")
+    study = partial(jaxslam.monte_carlo, SCENARIO, runs=2, cluster="tcp://127.0.0.1:9")
+    refused(study, "no Dask scheduler answers at 'tcp://127.0.0.1:9'", filters())
     monkeypatch.setitem(sys.modules, "distributed", None)
-    refused(r"needs the cluster extra .* pip install '\.\[cluster\]'$")
+    refused(study, r"needs the cluster extra .* pip install '\.\[cluster\]'$", filters())

@@ -267,15 +267,16 @@ def test_sizes_that_make_no_sense_are_refused(sizes, message):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"filters": {1: "world"}}, "the name of a filter is a word, not 1"),
-        ({"filters": {"": "world"}}, "the name of a filter is a word, not ''"),
-        ({"filters": {"a": "world"}}, "a is no AbstractFilter but str"),
-        ({"filters": {}}, "no filters by name"),
+        ({1: "world"}, "the name of a filter is a word, not 1"),
+        ({"": "world"}, "the name of a filter is a word, not ''"),
+        ({"a": "world"}, "a is no AbstractFilter but str"),
+        ({}, "no filters by name"),
+        *((x, "a dict is accepted, .* or a list of words") for x in ([], None, 3, [SCENARIO])),
     ],
 )
 def test_filters_that_are_none_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        jaxslam.monte_carlo("matched", runs=2, **given)
+        jaxslam.monte_carlo("matched", given, runs=2)
 
 
 # --- the summary ---------------------------------------------------------------------------------

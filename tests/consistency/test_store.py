@@ -236,17 +236,13 @@ def of_source(source):
         ("def f(x): return g(x)\ndef g(x): return x", "def f(x): return g(x)\ndef g(x): return -x"),
         ("a = 1\nf = lambda x: x + a", "a = 2\nf = lambda x: x + a"),
         ("def f(x, y=1): return y", "def f(x, y=2): return y"),
-        (
-            "import jax\ng = jax.jit(lambda x: x)\ndef f(x): return [g(y) for y in x]",
-            "import jax\ng = jax.jit(lambda x: -x)\ndef f(x): return [g(y) for y in x]",
-        ),
-        (
-            "class A:\n  def g(self): return 1\na = A()\ndef f(x): return a.g()",
-            "class A:\n  def g(self): return 2\na = A()\ndef f(x): return a.g()",
-        ),
+        ("import jax\ng = jax.jit(lambda x: x)\ndef f(x): return [g(y) for y in x]",
+         "import jax\ng = jax.jit(lambda x: -x)\ndef f(x): return [g(y) for y in x]"),
+        ("class A:\n  def g(self): return 1\na = A()\ndef f(x): return a.g()",
+         "class A:\n  def g(self): return 2\na = A()\ndef f(x): return a.g()"),
         ("def f(x): return f(x - 1)", "def f(x): return f(x - 2)"),
     ],
-)
+)  # fmt: skip
 def test_what_a_function_calls_is_a_part_of_it(before, after):
     assert described(of_source(before)) == described(of_source(before))
     assert difference(*map(described, map(of_source, (before, after))))
@@ -260,14 +256,3 @@ def test_code_that_cannot_be_seen_is_named(tmp_path, monkeypatch):
 
     with pytest.warns(UserWarning, match=r"not seen: abs\(…\), getattr\(…\) in f; .* resumed"):
         begin(FolderStore(tmp_path), monkeypatch, slam=FourFunctions(SLAM, function))
-
-
-def test_a_mended_helper_does_not_resume_the_old_numbers(tmp_path, monkeypatch):
-    def mine(sign):
-        source = f"def helper(x): return {sign}x\ndef f(x): return helper(x)"
-        return FourFunctions(SLAM, of_source(source))
-
-    begin(FolderStore(tmp_path), monkeypatch, slam=mine(""))
-    study(FolderStore(tmp_path, resume=True), slam=mine(""))
-    with pytest.raises(ValueError, match=r"cannot resume: .* another filter mine"):
-        study(FolderStore(tmp_path, resume=True), slam=mine("-"))

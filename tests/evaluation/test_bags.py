@@ -4,38 +4,21 @@ That every kind of a bag and of its messages is its arrays is a law of logs.
 """
 
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from bags import EPOCH, ros_of, write_bag
-from recordings import path_at
+import refusals
+from bags import ros_of, write_bag
+from logs import ESTIMATE, TIMES, TRUTH, in_space, in_the_world
+from logs import P as MIXED
 from recordings import write as write_path
-from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.evaluation import write_covariances
 from jaxslam.io import write_tum
 
-STEPS = 24
-TIMES = EPOCH + np.arange(STEPS) / 10
-SPLIT = jaxslam.Convention("split", "world")
-
-
-def run(seed=0):
-    """Estimates with covariances in ROS' convention, and truths."""
-    (position, turn), draw = path_at(TIMES - EPOCH), np.random.default_rng(seed)
-    truth = np.tile(np.eye(4), (STEPS, 1, 1))
-    truth[:, :3, :3], truth[:, :3, 3] = turn.as_matrix(), 20 * position
-    sigma = np.array([0.1, 0.02, 0.05, 0.01, 0.03, 0.002])
-    root = sigma[:, None] * (np.eye(6) + 0.2 * draw.normal(size=(6, 6)))
-    noise = draw.normal(size=(STEPS, 6)) @ root.T
-    estimate = truth.copy()
-    estimate[:, :3, 3] -= noise[:, :3]
-    estimate[:, :3, :3] = Rotation.from_rotvec(-noise[:, 3:]).as_matrix() @ truth[:, :3, :3]
-    return estimate, np.tile(root @ root.T, (STEPS, 1, 1)), truth
-
-
-ESTIMATE, P, TRUTH = run()
+P, SPLIT = in_the_world(MIXED), jaxslam.Convention("split", "world")
 
 
 def odometry(r, poses=ESTIMATE, covariances=P, stamps=TIMES):
@@ -88,29 +71,23 @@ def test_poses_of_two_bodies_are_told(tmp_path):
 
 
 def test_a_folder_of_bags_is_of_runs_and_tells_the_convention(tmp_path):
-    """Written about the body's axes, as by a filter that does not heed what ROS says."""
+    """Written with rotations about the body's axes, as by a filter that does not heed what ROS
+    says."""
     names, runs = ("a.bag", "b.mcap", "c", "d.db3", *(f"{i}.mcap" for i in range(4))), []
-    for seed, name in enumerate(names):
-        estimate, world, truth = run(seed)
-        M = np.zeros((STEPS, 6, 6))
-        M[:, :3, :3] = M[:, 3:, 3:] = np.swapaxes(estimate[:, :3, :3], -1, -2)
-        body, r = M @ world @ np.swapaxes(M, -1, -2), ros_of(name)
-        told = {"/odom": odometry(r, estimate, body), "/truth": poses(r, truth)}
+    for name in names:
+        (estimate, P, truth), r = in_space(), ros_of(name)
+        told = {"/odom": odometry(r, estimate, P), "/truth": poses(r, truth)}
         write_bag(tmp_path / name, told)
-        runs.append(jaxslam.evaluate_poses(estimate[None], body[None], truth[None], SPLIT).nees[0])
+        runs.append(jaxslam.evaluate_poses(estimate[None], P[None], truth[None], SPLIT).nees[0])
     found = jaxslam.evaluate_log(tmp_path)
     np.testing.assert_allclose(found.nees, np.array(runs)[np.argsort(names)], rtol=1e-9)
     assert found.suggested is not None
-    assert (found.suggested.error, found.suggested.axes) == ("split", "body")
-    stated = jaxslam.evaluate_log(tmp_path, stated={"error": "split", "axes": "body"})
+    assert (found.suggested.error, found.suggested.axes) == ("split", "mixed")
+    stated = jaxslam.evaluate_log(tmp_path, stated={"error": "split", "axes": "mixed"})
     assert np.nanmean(stated.nees) < 7
 
 
-def refused(message, *given, **more):
-    with pytest.raises(ValueError, match=message) as caught:
-        jaxslam.evaluate_log(*given, **more)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+refused = partial(refusals.refused, jaxslam.evaluate_log)
 
 
 def test_topics_are_listed_where_none_or_several_fit(tmp_path):

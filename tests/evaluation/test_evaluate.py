@@ -50,21 +50,6 @@ def test_nees_verdict_and_shares_are_those_of_the_definitions():
     assert dict(jax.config.values) == before
 
 
-@pytest.mark.parametrize(
-    ("factor", "word"), [(1.0, "consistent"), (1.3, "over-confident"), (0.8, "under-confident")]
-)
-def test_the_verdict_says_by_what_factor_sigma_is_wrong(factor, word):
-    found = jaxslam.evaluate(*drawn(runs=400, factor=factor))
-    assert found.verdict["word"] == word
-    low, high = found.verdict["interval99"]
-    assert low < factor < high < low + 0.18
-    for axis in range(3):
-        low, high = found.axis_verdict(axis)["interval99"]
-        assert low < factor < high
-    assert word in str(found)
-    assert word in found.headline
-
-
 def as_unit(e):
     return e, np.broadcast_to(np.eye(e.shape[-1]), (*e.shape, e.shape[-1]))
 

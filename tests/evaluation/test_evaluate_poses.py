@@ -25,13 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.evaluation import Convention, converted, pose_errors
-from jaxslam.evaluation.alignment import (
-    Similarity,
-    associated,
-    gauge_directions,
-    projected,
-    similarity,
-)  # fmt: skip
+from jaxslam.evaluation.alignment import Similarity, associated, gauge_directions, similarity
 from jaxslam.evaluation.comparison import with_truth
 from jaxslam.evaluation.convention import (
     CHOICES,
@@ -43,7 +37,7 @@ from jaxslam.evaluation.convention import (
     write_covariances,
 )  # fmt: skip
 from jaxslam.evaluation.convention_search import Tried, identify
-from jaxslam.evaluation.inputs import Poses, checked_poses
+from jaxslam.evaluation.inputs import checked_poses
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
@@ -461,21 +455,6 @@ def diagonal(blocks):
     return np.einsum("kij,kl->kilj", blocks, np.eye(count)).reshape(count * n, count * n)
 
 
-def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
-    T, P = some(SPATIAL, (5,), 2), np.stack([covariance(6, seed) for seed in range(5)])
-    poses = Poses(T, P, T, np.ones(5, bool), SPLIT, align="sim3")
-    (one, _), (other, _) = projected(poses), projected(poses._replace(joint=diagonal(P)))
-    np.testing.assert_allclose(one, other, atol=1e-12)
-    U = gauge_directions(T, "sim3")
-    V = U.copy()
-    V[:, 3:] = 0
-    U, V = U.reshape(30, 7), V.reshape(30, 7)
-    Q = np.eye(30) - U @ np.linalg.inv(V.T @ U) @ V.T
-    whole = (Q @ diagonal(P) @ Q.T).reshape(5, 6, 5, 6)
-    for k in range(5):
-        np.testing.assert_allclose(one[k], whole[k, :, k], atol=1e-12)
-
-
 def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there():
     convention = Convention("left")
     T, P, truth = logged(convention)
@@ -573,32 +552,17 @@ def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
     assert read_covariances(path).convention == Convention()
 
 
-def test_a_folder_of_runs_is_its_arrays_and_what_is_stated_comes_before_what_files_say(tmp_path):
-    convention = Convention("split", "mixed", "rotation-first")
-    T, P, truth = logged(convention, runs=3)
-    write_runs(tmp_path, T, P, truth, convention)
-    found, arrays = jaxslam.evaluate_log(tmp_path), jaxslam.evaluate_poses(T, P, truth, convention)
-    # Nine decimals of poses whose least σ is 5e-3.
-    np.testing.assert_allclose(found.nees, arrays.nees, rtol=1e-4)
-    written = found.asdict()
-    assert written["convention"] == {
-        "error": "split", "axes": "mixed", "order": "rotation-first", "scale": "marginal",
-    }  # fmt: skip
-    assert written["time"] == pytest.approx(np.arange(6) / 10)
-    assert list(written["rmse"]) == ["rx", "ry", "rz", "x", "y", "z"]
-    stated = {"error": "left", "order": "position-first"}
-    assert jaxslam.evaluate_log(tmp_path, stated=stated).convention == Convention("left", "world")
-
-
 def test_runs_in_folders_are_compared_as_far_as_each_goes_and_named_where_they_are_lost(tmp_path):
-    T, P, truth = (np.array(x) for x in logged(Convention(), runs=3))
+    """In the convention that files say, unless another one is stated."""
+    convention = Convention("split", "mixed", "rotation-first")
+    T, P, truth = (np.array(x) for x in logged(convention, runs=3))
     truth[0, 3:, :3, 3] += 50.0
-    write_runs(tmp_path, T, P, truth, Convention())
+    write_runs(tmp_path, T, P, truth, convention)
     times = np.arange(6) / 10
     write_tum(tmp_path / "run01" / "truth.txt", times[:4], truth[1, :4])
     write_tum(tmp_path / "run02" / "estimate.txt", times[:5], T[2, :5])
     found = jaxslam.evaluate_log(tmp_path)
-    arrays = jaxslam.evaluate_poses(T, P, truth)
+    arrays = jaxslam.evaluate_poses(T, P, truth, convention)
     assert found.steps == 6
     there = np.ones((3, 6), bool)
     there[1, 4:], there[2, 5:] = False, False
@@ -611,10 +575,17 @@ def test_runs_in_folders_are_compared_as_far_as_each_goes_and_named_where_they_a
     assert "runs have 5 to 6 poses" in told
     assert written["lost_runs"] == ["run00"]
     assert written["run_names"] == ["run00", "run01", "run02"]
+    assert written["convention"] == {
+        "error": "split", "axes": "mixed", "order": "rotation-first", "scale": "marginal",
+    }  # fmt: skip
+    assert written["time"] == pytest.approx(times)
+    assert list(written["rmse"]) == ["rx", "ry", "rz", "x", "y", "z"]
+    stated = {"error": "left", "order": "position-first"}
+    assert jaxslam.evaluate_log(tmp_path, stated=stated).convention == Convention("left", "world")
     assert "steps are counted" not in told
     slower = np.arange(6) / 5
     write_tum(tmp_path / "run01" / "estimate.txt", slower, T[1])
-    write_covariances(tmp_path / "run01" / "covariance.txt", slower, P[1], Convention())
+    write_covariances(tmp_path / "run01" / "covariance.txt", slower, P[1], convention)
     write_tum(tmp_path / "run01" / "truth.txt", slower, truth[1])
     told = str(jaxslam.evaluate_log(tmp_path))
     assert "their times differ between runs, and are those of run00" in told

@@ -121,12 +121,11 @@ def compiled_retract():
     return quick_jit(retract)
 
 
-def assert_updated(after, innovation, state, H, residual, bound, considered=slice(0, 0)):
-    """Joseph's form, with the optimal gain but for what is considered, which has none."""
+def assert_updated(after, innovation, state, H, residual, bound):
+    """Joseph's form, with the optimal gain."""
     P, R, c = np.asarray(state.covariance), 0.09 * np.eye(len(H)), state.core_dim
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)
-    K[considered] = 0
     left = np.eye(len(P)) - K @ H
     close(after.covariance, left @ P @ left.T + K @ R @ K.T, bound)
     np.testing.assert_array_equal(after.covariance, after.covariance.T)
@@ -211,25 +210,6 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change):
     assert one.nis == other.nis > 0
     assert one.nis_dof == other.nis_dof == 1
     np.testing.assert_array_equal(one.used, [False, True, False])
-
-
-def test_considered_numbers_count_but_are_not_corrected():
-    """Schmidt (1966)."""
-    state, _, dense, jacobian = planar_case()
-    model = slam_model(PLANAR, InverseScaling(), Robocentric())
-    context = Context(jnp.asarray(STEP))
-    k = slice(state.core_dim - 2, state.core_dim)  # the calibration
-    seen = Features(jnp.arange(3), planar_pixels(state), jnp.ones(3, bool))
-    updated, innovation = quick_jit(
-        lambda state: update(model, state, seen, noise_of(PLANAR), context, k)
-    )(state)
-    zero = np.zeros(len(state.covariance))
-    H = np.asarray(jacobian(state, zero))[:3]
-    residual = np.asarray(seen.measured).ravel() - np.asarray(dense(state, zero))[:3]
-    assert_updated(updated, innovation, state, H, residual, 1e-10, considered=k)
-    np.testing.assert_array_equal(updated.core.calibration, state.core.calibration)
-    close(updated.covariance[k, k], state.covariance[k, k], 1e-14)
-    assert np.abs(updated.covariance[k] - state.covariance[k]).max() > 1e-3
 
 
 @pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from jaxslam.io.calibration import Calibration, from_field_of_view, write_calibration
 from jaxslam.io.lens_files import read_calibration
@@ -214,7 +215,4 @@ def test_what_is_no_calibration_is_refused_naming_file_and_field(file, words, tm
     path, text = tmp_path / file[0], file[1]
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ValueError, match=words) as caught:
-        read_calibration(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(path) in refused(read_calibration, words, path)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refused
 from videos import SENSOR, pose, words
 
 from jaxslam.io import read_inertial_calibration
@@ -101,10 +102,7 @@ def test_the_files_of_every_program_are_one_calibration(name, tmp_path):
 def test_what_is_missing_or_implausible_is_named(old, new, message, tmp_path):
     spoilt = {name: text.replace(old, new) for name, text in FILES["Kalibr"].items()}
     paths = write(tmp_path, spoilt)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_inertial_calibration(*paths)
-    assert str(paths[0]) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(paths[0]) in refused(read_inertial_calibration, message, *paths)
 
 
 def test_poses_and_files_that_are_none_are_refused(tmp_path):

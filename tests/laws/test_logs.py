@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from logs import LOGS, TIMES
+from refusals import refused
 
 TEXTS = [name for name in LOGS if not (name.startswith(("npz", "mat", "bag")) or "16" in name)]
 TABLES = [name for name in TEXTS if name.startswith("CSV")]
@@ -22,12 +23,6 @@ def written(request, tmp_path):
 
 def of_logs(names):
     return pytest.mark.parametrize("written", names, indirect=True, ids=str)
-
-
-def refused(call, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        call()
-    assert "\n" not in str(caught.value)
 
 
 @cache

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import keys_used, quick_jit, simulated
+from cases import FALSE_ALARM, centred, keys_used, quick_jit, simulated, standard_normal
 from scipy import stats
 
 from jaxslam._numerics.arrays import cast
@@ -19,9 +19,6 @@ from jaxslam.models.motion import ConstantVelocity, Odometry
 from jaxslam.models.sensors import Pinhole, Position
 from jaxslam.simulation import BUILT_IN, Room, features, gone, scenario, sightings, simulate
 from jaxslam.simulation.scenario import parse_override
-
-FALSE_ALARM = 1e-6
-"""Share of seeds on which a statistical test here would fail although nothing is wrong."""
 
 
 def batch(chosen, count):
@@ -310,18 +307,6 @@ def pixels_without_noise(runs, chosen):
 
     ideal, seen = quick_jit(jax.vmap(jax.vmap(one, (0, None))))(runs.poses, runs.points)
     return np.asarray(ideal), np.asarray(seen)
-
-
-def standard_normal(numbers):
-    """Have independent numbers the variance and the mean of standard normal ones, but for
-    FALSE_ALARM?"""
-    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], numbers.size)
-    assert low < np.sum(np.square(numbers)) < high
-    centred(numbers)
-
-
-def centred(numbers):
-    assert abs(numbers.mean()) * np.sqrt(numbers.size) < stats.norm.isf(FALSE_ALARM / 2)
 
 
 def uniform(numbers, low, high):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit, simulated
+from cases import FALSE_ALARM, quick_jit, simulated
 from recordings import path_at, write
 from scipy import stats
 from scipy.spatial.transform import Rotation
@@ -15,9 +15,6 @@ import jaxslam
 from jaxslam.io.tum import poses
 from jaxslam.simulation import RecordedMotion, scenario, simulate, trajectory_of
 from jaxslam.simulation.trajectories import GAP, find, sampled
-
-FALSE_ALARM = 1e-6
-"""Share of seeds on which a statistical test here would fail although nothing is wrong."""
 
 
 def with_a_gap(rate=50.0):

@@ -72,8 +72,11 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     assert np.all(eigenvalues[1:, 0] > 1e-8 * eigenvalues[1:, -1])
     assert not covariances[0].any()
     header = (out / "covariance.txt").read_text().splitlines()[0]
-    for word in ("scale=marginal", "length=map", "which the filter takes as exactly known)"):
-        assert word in header
+    for words in (
+        "error=split axes=body", "scale=marginal", "length=map",
+        "which the filter takes as exactly known)",
+    ):  # fmt: skip
+        assert words in header
     assert "in the unit of each map" in (out / "trajectory.txt").read_text().splitlines()[0]
     ate = absolute_trajectory_error(times, T_wc, *source.reference)
     assert ate["rmse"] == pytest.approx(summary["ate"]["rmse"], rel=1e-3)

@@ -125,15 +125,13 @@ WRITTEN = [
     (film("overlay.gif"), r"must end in \.mp4"),
     (film("missing/overlay.mp4"), "cannot be opened"),
     (film("overlay.mp4", np.zeros((48, 66, 3), np.uint8)), "does not fit"),
-    (
-        lambda x: write_ply(x / "map.ply", np.zeros((2, 3)), np.eye(3)[None], [1, 2], [0, 0]),
-        "2 points, 1 covariances",
-    ),
+    (lambda x: write_ply(x / "map.ply", np.zeros((2, 3)), np.eye(3)[None], [1, 2], [0, 0]),
+     "2 points, 1 covariances"),
     (lambda x: write_ply(x / "map.ply", [[np.nan, 0, 0]], np.eye(3)[None], [1], [0]), "not finite"),
     (never_tracked, "without any frame"),
     (viewed("seen.rrd", rerun=False), r"needs the viewer extra \(rerun is missing\)"),
     (viewed("seen.mp4"), r"seen\.mp4: the name must end in \.rrd"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("call", "message"), READ + WRITTEN)
@@ -171,21 +169,17 @@ OF_CALLS = [
     (lambda: synthetic_source(frames=0), "frames must be positive"),
     (lambda: synthetic_source(rate=0.0), "rate must be positive"),
     (forward, "closer than"),
-    (
-        lambda: TrackerSettings(calibration="maybe"),
-        "unknown calibration 'maybe'; known: white, consider",
-    ),
+    (lambda: TrackerSettings(calibration="maybe"),
+     "unknown calibration 'maybe'; known: white, consider"),
     (lambda: TrackerSettings(filter="nothing"), "unknown .* 'nothing'; known:"),
     (lambda: TrackerSettings(landmarks="nothing"), "unknown .* 'nothing'; known:"),
     *[
         (begun_with_a_target(filter=name), rf"filter {name.replace('+', '.')} cannot begin with a")
         for name in ("scale_gauge", "world+scene50", "world+mixture3")
     ],
-    (
-        begun_with_a_target(filter="world", wanted=3),
-        "the target has 4 points, but only 3 landmarks are wanted",
-    ),
-]
+    (begun_with_a_target(filter="world", wanted=3),
+     "the target has 4 points, but only 3 landmarks are wanted"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("call", "message"), OF_CALLS)

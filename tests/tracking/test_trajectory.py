@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam._runtime.files import write_atomically
-from jaxslam.evaluation import pose_errors, read_covariances, write_covariances
 from jaxslam.io.tum import poses, read_tum, write_tum
 from jaxslam.tracking.trajectory import (
-    TRACKED,
     absolute_trajectory_error,
     orientation_error,
     relative_pose_error,
@@ -66,24 +64,6 @@ def test_interrupted_write_keeps_the_old_file(tmp_path):
         raise KeyboardInterrupt
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
-    """Errors drawn from them, in the camera's axes, have a mean NEES of 6."""
-    rng, n = np.random.default_rng(0), 4000
-    roots = rng.normal(0, 0.01, (n, 6, 6))
-    times, T_wc = wave(n)
-    P = roots @ np.swapaxes(roots, 1, 2)
-    write_covariances(tmp_path / "covariance.txt", times, P, TRACKED)
-    read_times, P, _ = read_covariances(tmp_path / "covariance.txt")
-    np.testing.assert_allclose(read_times, times, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(P, roots @ np.swapaxes(roots, 1, 2), rtol=1e-8, atol=1e-12)
-    errors = np.einsum("nij,nj->ni", roots, rng.normal(size=(n, 6)))
-    E = poses(errors[:, :3], Rotation.from_rotvec(errors[:, 3:]).as_quat())
-    e = pose_errors(TRACKED, T_wc, T_wc @ E)
-    nees = np.sum(e * np.linalg.solve(P, e[..., None])[..., 0], axis=-1)
-    # The mean of n numbers of χ² with 6 degrees of freedom: σ = √(12/n) = 0.055.
-    assert abs(nees.mean() - 6) < 0.22
 
 
 # --- errors ---------------------------------------------------------------------------------------
