@@ -3,6 +3,9 @@
 import csv
 import json
 import resource
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -107,6 +110,35 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(after, tmp_path, 
         tracked(small(20), tmp_path, progress=look)
     assert counts == list(range(2, after + 1))
     assert names(tmp_path) == (ALL if after > 1 else set())
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from jaxslam.tracking import video
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.synthetic import synthetic_source
+assert "rerun" not in sys.modules  # which only a recording needs
+
+class Still:
+    def __init__(self, *_):
+        self.seen = 0
+    def track(self, frame):
+        self.seen += 1
+        if self.seen == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Tracked(frame.index, frame.time, PoseWithCovariance())
+
+video.Tracker = Still
+video.track(synthetic_source(9, width=160, height=120), Path(sys.argv[1]), overlay=False)
+"""
+
+
+def test_a_process_that_is_killed_leaves_what_was_tracked_before(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], cwd=Path.cwd())
+    assert ended.returncode == -signal.SIGKILL
+    assert frames_in(tmp_path) == 4
 
 
 def test_a_line_for_which_there_is_no_room_is_not_begun(tmp_path):
