@@ -235,6 +235,8 @@ class LogFaults(Benchmark):
 
     logs: int = 20
     """Of every fault and factor."""
+    factors: tuple[float, ...] = FACTORS
+    """By which σ is too small."""
     seconds: float = 600.0
     """After so many no further round of logs begins."""
     out: Path = RESULTS / "log_faults.json"
@@ -245,7 +247,7 @@ class LogFaults(Benchmark):
             if time.monotonic() - start > self.seconds:
                 return
             for name in FAULTS:
-                for factor in FACTORS:
+                for factor in self.factors:
                     said = judged(name, factor, number)[0]
                     counts.setdefault((name, factor), Counter())[said] += 1
             rows = [
