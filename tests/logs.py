@@ -581,6 +581,9 @@ LOGS = {
             "q_w,q_z,q_x,q_y,pos_z [m],status,pos_y [m],pos_x [m],timestamp [s]\n",
         )
     ),
+    "titles of a rotation, with w": Log(
+        trajectories("t qw qx qy qz x y z", "t,rw,rx,ry,rz,tx,ty,tz\n")
+    ),
     "titles of ROS' CSV": Log(
         trajectories(
             "seq x y z qx qy qz qw t",

@@ -297,7 +297,7 @@ def _of_runs(
     if automatic:
         found = described(found, time_offset=late)
     told += _remarks(read)
-    if not logs[0].estimate.said and not stated:
+    if (logs[0].estimate.assumed or not logs[0].estimate.said) and not stated:
         told.append(f"the file does not state its convention; assumed: {convention}")
     return described(found, notes=(*found.notes, *told), run_names=names)
 

@@ -194,6 +194,10 @@ OF_FILES = [
     (with_truth_sigma(np.nan, 1), "truth_sigma must be"),
     (covariances("0 1 2 3\n"), r"c\.txt, line 1: expected 22 finite numbers"),
     (covariances("# a\n" + "nan " * 22), r"c\.txt, line 2: expected 22 finite numbers"),
+    (
+        covariances("1 1 nan" + UPPER[5:]),
+        r"line 1: expected a covariance of finite numbers, or of NaN alone .* has the variance −1",
+    ),
     (covariances("# error=lfet\n" + UPPER), r"c\.txt: unknown error 'lfet' \(did you mean left\?"),
     (covariances("# eror=left\n" + UPPER), r"c\.txt: unknown key 'eror' in the header \(did you"),
     (covariances("# angle=grad\n" + UPPER), r"c\.txt: unknown angle 'grad'"),
@@ -296,6 +300,13 @@ OF_FOLDERS = [
         of_text("estimate.txt", "#%FORMAT SQUARE/0.3\n#%TIMESTAMP_UNIT weeks\n" + "1 " * 29),
         r"the header TIMESTAMP_UNIT is weeks; expected seconds or milliseconds or",
     ),
+    (
+        of_text("estimate.txt", "t,x,y,z,qx,qy,qz,qw,sx,sy,sz\n0,1,1,1,0,0,0,1,1,nan,1\n"),
+        r"estimate\.txt, line 2: expected a covariance of finite numbers, or of NaN alone",
+    ),
+    (of_text("estimate.txt", f"0 1 2 3 0 0 0 1 nan{20 * ' 0'}\n"), "line 1: .* or of NaN alone"),
+    (of_text("truth.txt", "0 1 2 0.5\n0 1 2 1e101\n"), r"line 2: expected numbers up to 1e\+100"),
+    (of_text("truth.txt", "VERTEX_SE2 0 1 2 1e101\n"), r"line 1: expected VERTEX.*up to 1e\+100"),
     (of_text("estimate.txt", "0 1 2 3 4 5\n"), r"line 1: 6 columns are no known format; expected"),
     (of_text("truth.txt", "a,t,b\n0,1,2\n"), r"line 2: 3 columns \(a, t, b\) are no known format"),
     (
