@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import combinations
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -20,7 +21,6 @@ from jaxslam.evaluation.alignment import (
     nearest_rotation,
     similarity,
 )
-from jaxslam.evaluation.clock import increments
 from jaxslam.evaluation.comparison import compared
 from jaxslam.evaluation.convention import Matrices
 from jaxslam.evaluation.inputs import Poses
@@ -49,6 +49,7 @@ HALF = 1.3
 MANY = 10
 """Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
+Transform = Float[np.ndarray, "d d"]
 FEWEST, ALPHA = 4, 1e-3
 """The fewest runs that a constant can be common to, and the chance that one is found of none."""
 
@@ -62,16 +63,15 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
     if few is not poses:
         poses, found = few, compared(few)
     turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
-    looks = (*((_w_first,) if turns else ()), _worlds, _tilt, _mounting)
-    possible = []
-    for look in (*looks, *((_half_angles,) if turns else ())):
-        with suppress(ValueError):  # of a first pose that is known exactly, and then would not be
-            if mistake := look(poses, found):
-                possible.append(mistake)
-                if MAY not in mistake.what:
-                    possible = [mistake]
-                    break
-    yield from possible
+    told: list[Mistake] = []
+    for look in (_w_first, _worlds, _tilt, _mounting, _half_angles)[not turns : 4 + turns]:
+        # A first pose that is known exactly would not be; or positions coincide.
+        with suppress(ValueError):
+            told += filter(None, [look(poses, found)])
+        if told and MAY not in told[-1].what:
+            told = told[-1:]
+            break
+    yield from told
 
 
 def suspect(found: Evaluation) -> bool:
@@ -81,6 +81,11 @@ def suspect(found: Evaluation) -> bool:
 
 def _right(found: Evaluation) -> bool:
     return not found.mistakes and not_disproved(found.verdict)
+
+
+def explained(found: Evaluation) -> bool:
+    """Whether little is left to be wrong: nothing by the verdict, which may allow for much."""
+    return found.of_nees["word"] not in WORSE and _nees(found) < LESS * found.dof
 
 
 def _nees(found: Evaluation) -> float:
@@ -106,17 +111,15 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
     ]
     # Poses that every run shares, such as a first one, are no copies.
     rows = [own - set.intersection(*rows) for own in rows] if len(rows) > 2 else rows
-    for second in range(1, len(rows)):
-        for first in range(second):
-            fewest = min(len(rows[first]), len(rows[second]))
-            same = len(rows[first] & rows[second])
-            if same >= MANY and same > 0.5 * fewest:
-                yield Mistake(
-                    "the same run twice",
-                    f"run {first} and run {second} share {same} of {fewest} estimates to the last "
-                    "digit: they are one run, not two independent ones; leave one out",
-                )
-                return
+    for (first, own), (second, other) in combinations(enumerate(rows), 2):
+        fewest, same = min(len(own), len(other)), len(own & other)
+        if same >= MANY and same > 0.5 * fewest:
+            yield Mistake(
+                "the same run twice",
+                f"run {first} and run {second} share {same} of {fewest} estimates to the last "
+                "digit: they are one run, not two independent ones; leave one out",
+            )
+            return
 
 
 def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
@@ -161,13 +164,10 @@ def _worlds(poses: Poses, found: Evaluation) -> Mistake | None:
     if poses.align != "none":
         return None
     n = poses.estimates.shape[-1] - 1
-    try:
-        rows = [
-            _apart(*(x[run, there, :n, n] for x in (poses.estimates, poses.truths)))
-            for run, there in enumerate(poses.logged)
-        ]
-    except ValueError:
-        return None
+    rows = [
+        _apart(*(x[run, there, :n, n] for x in (poses.estimates, poses.truths)))
+        for run, there in enumerate(poses.logged)
+    ]
     rms, left, scaled, first, angle, tilt = np.median(rows, axis=0)
     own = found.sigmas[found.logged][:, [not name.startswith("r") for name in found.names]]
     sigma = float(np.median(own)) * (1 if len(rows) >= FEWEST else 2) if own.size else 0.0
@@ -209,9 +209,8 @@ def _tilt(poses: Poses, found: Evaluation) -> Mistake | None:
     if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
         return None
     told = f"{why}: with --align {other} {_instead(fixed, found)}"
-    what = f"an alignment by {poses.align}"
-    what += "" if len(poses.logged) >= FEWEST else f"{MAY}be wrong"
-    return Mistake(what, told, _nees(fixed))
+    sure = "" if len(poses.logged) >= FEWEST else f"{MAY}be wrong"
+    return Mistake(f"an alignment by {poses.align}{sure}", told, _nees(fixed))
 
 
 def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
@@ -228,7 +227,7 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     n = len(X) - 1
     angle, metres = float(angles(X[:n, :n], np.eye(n))), float(np.linalg.norm(X[:n, n]))
     certain = _of_body(poses, found, best, angle) or (_right(best) and _in_all_runs(X, moved))
-    if not certain and not _right(best):
+    if not certain and not explained(best):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
     parts += [f"a lever arm of {metres:.3g} m"] if metres > 0 else []
@@ -248,59 +247,43 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     )
 
 
-def _mounted(
-    poses: Poses, found: Evaluation, X: Float[np.ndarray, "d d"], *, arm: bool
-) -> Float[np.ndarray, "d d"]:
-    """X that makes NEES least, by Gauss and Newton, from the mean rotation, or that of increments.
+def _mounted(poses: Poses, found: Evaluation, X: Transform, *, arm: bool) -> Transform:
+    """X that makes NEES least, by Gauss and Newton, from the mean rotation.
 
-    Its arm is zero along directions that the rotations do not determine.
+    Its arm is zero along directions that the rotations do not determine. Without an arm it is of
+    rotations alone, whose positions one may move.
     """
-    n, each, X = len(X) - 1, np.median(found.sigmas[found.logged], axis=0), X.copy()
-    turns = np.array([name.startswith("r") for name in found.names])
-    if not arm and poses.align != "none" and n == 3:
-        X[:n, :n] = _by_increments(poses)
-    elif not arm:
-        R, true = (x[poses.logged][:, :n, :n] for x in (poses.estimates, poses.truths))
+    n, unit = len(X) - 1, np.eye(len(X))
+    turns = tuple(name for name in found.names if name.startswith("r"))
+    if not arm and turns:
+        world = aligned(poses._replace(used=())).poses
+        X, poses = X.copy(), poses._replace(used=turns)
+        R, true = (x[poses.logged][:, :n, :n] for x in (world.estimates, world.truths))
         X[:n, :n] = nearest_rotation((np.swapaxes(R, 1, 2) @ true).mean(axis=0))
-    steps = np.zeros((3 if n == 3 else 1, n + 1, n + 1))
-    steps[:, :n, :n] = np.cross(np.eye(3)[3 - len(steps) :, None], np.eye(3))[:, :n, :n]
-    along = np.eye(n + 1)[: n * arm, :, None] * np.eye(n + 1)[n]
-    sizes = (np.median(each[part]) if part.any() else 1.0 for part in (turns, ~turns))
-    steps = np.concatenate([x * size for x, size in zip((steps, along), sizes, strict=True)])
-    # A rotation is that of rotations alone, whose positions an arm may move.
-    only = tuple(name for name in found.names if name.startswith("r") and not arm)
-    fit = poses._replace(used=only or found.names)
+    own = dict(zip(found.names, np.median(found.sigmas[found.logged], axis=0), strict=True))
+    sigma = [np.median([own[x] for x in own if (x in turns) == turn] or 1.0) for turn in (0, 1)]
+    pairs = [(i, j) for i, j in combinations(range(n + 1), 2) if arm or j < n]
+    steps = np.array([sigma[j < n] * np.outer(unit[i], unit[j]) for i, j in pairs])
+    steps = steps - np.swapaxes(steps, 1, 2)
+    steps[:, n] = 0.0
 
-    def moved(by: Float[np.ndarray, " k"]) -> Float[np.ndarray, "d d"]:
-        result = X @ (np.eye(n + 1) + np.tensordot(by, steps, 1))
+    def moved(by: Float[np.ndarray, " k"]) -> Transform:
+        result = X @ (unit + np.tensordot(by, steps, 1))
         result[:n, :n] = nearest_rotation(result[:n, :n])
         return result
 
     for _ in range(ROUNDS):
-        X_each = (moved(x) for x in np.vstack([np.zeros(len(steps)), SMALL * np.eye(len(steps))]))
-        z, *others = (_without(fit, x).whitened[found.logged].ravel() for x in X_each)
-        J = np.column_stack([(x - z) / SMALL for x in others])
-        if not (np.isfinite(z).all() and np.isfinite(J).all()):
+        each = (moved(SMALL * x) for x in np.eye(len(steps) + 1)[:, 1:])
+        z, *others = (_without(poses, x).whitened[found.logged].ravel() for x in each)
+        if not np.isfinite([z, *others]).all():
             break
+        J = (np.array(others) - z).T / SMALL
         X = moved(np.linalg.lstsq(J, -z, rcond=UNDETERMINED)[0])
     return X
 
 
-def _without(poses: Poses, X: Float[np.ndarray, "d d"]) -> Evaluation:
+def _without(poses: Poses, X: Transform) -> Evaluation:
     return compared(poses._replace(truths=poses.truths @ np.linalg.inv(X)))
-
-
-def _by_increments(poses: Poses) -> Float[np.ndarray, "3 3"]:
-    """C of `φ̂ = C φ`, rotation vectors from pose to pose; 1 where they do not determine it."""
-    own, true = (
-        np.concatenate([increments(run) for run in np.where(there, T, np.nan)])
-        for there in [poses.logged[..., None, None]]
-        for T in (poses.estimates, poses.truths)
-    )
-    both = ~np.isnan(own).any(axis=1)
-    M = own[both].T @ true[both]
-    singular = np.linalg.svd(M, compute_uv=False)
-    return np.eye(3) if singular[1] < UNDETERMINED * singular[0] else nearest_rotation(M)
 
 
 def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -> bool:
@@ -322,11 +305,11 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
     few = ratio[turns].max(initial=0.0) < LESS * ratio[~turns].max(initial=0.0)
     # Of few runs errors of a filter are alike too.
     least = LESS if len(poses.logged) >= FEWEST else LESS**2
-    explained = (ratio > least) & (ratio > LESS * left)
-    return bool(explained.any() and left.max() < UNEXPLAINED and not (in_world and few))
+    most = (ratio > least) & (ratio > LESS * left)
+    return bool(most.any() and left.max() < UNEXPLAINED and not (in_world and few))
 
 
-def _in_all_runs(X: Float[np.ndarray, "d d"], unmounted: Poses) -> bool:
+def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
     """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
     n, moved = len(X) - 1, aligned(unmounted._replace(used=())).poses
     if len(moved.logged) < FEWEST:
@@ -348,31 +331,20 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
     """Covariances of the vector part of a quaternion: σ of all rotations is half, and no other."""
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in poses.names])
     whole = poses._replace(covariances=scale[:, None] * poses.covariances * scale)
-    fixed, certain = compared(whole), _all_halves(found)
-    parts = [tuple(x for x in found.names if x.startswith("r") == turn) for turn in (False, True)]
-    alone = [compared(whole._replace(used=part)) for part in parts if part and not certain]
-    if not all(map(_right, (fixed, *alone))):
+    fixed, certain = compared(whole), len(poses.logged) >= FEWEST
+    if not _right(fixed) or not explained(fixed):
         return None
+    parts = (tuple(x for x in found.names if x.startswith("r") == turn) for turn in (False, True))
+    for names in filter(None, parts):
+        if not explained(part := compared(whole._replace(used=names))):
+            return None
+        off = np.log([part.axis_verdict(i)["sigma_factor"] or np.inf for i in range(len(names))])
+        # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
+        certain &= bool(abs(off.mean()) <= np.log(HALF) and np.ptp(off) <= 3 * np.log(HALF))
     return Mistake(
         "half angles" if certain else f"the covariances{MAY}be of half angles",
         "σ of all rotations is half of the right one, and that of positions right, as if the "
         f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
         f"header {_instead(fixed, found)}. If they are of angles, the filter is over-confident",
         _nees(fixed),
-    )
-
-
-def _all_halves(found: Evaluation) -> bool:
-    """Whether the σ of every axis alone shows that."""
-    off: dict[float, list[float]] = {1.0: [], 2.0: []}
-    for i, name in enumerate(found.names):
-        verdict, factor = found.axis_verdict(i), 2.0 if name.startswith("r") else 1.0
-        (low, high), own = verdict["interval99"], verdict["sigma_factor"]
-        if not own or (low or 0.0) > 1.05 * factor or (high or np.inf) < 0.95 * factor:
-            return False
-        off[factor].append(np.log(own / factor))
-    # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
-    return all(
-        abs(np.mean(part)) <= np.log(HALF) and np.ptp(part) <= 3 * np.log(HALF)
-        for part in filter(None, off.values())
     )

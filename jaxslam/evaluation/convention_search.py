@@ -186,8 +186,9 @@ def identify(
         finite |= free
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
     stands, whole = own is not None and own.consistent, own is not None and own.whole
-    possible = min((c for c, x in finite.items() if x.right), key=lambda c: means[c], default=None)
-    better = None if equal else better
+    # Not given the scale, of which a fit takes more than a wrong convention adds.
+    right = (c for c in finite.keys() & tried.keys() if finite[c].right)
+    possible, better = min(right, key=means.__getitem__, default=None), None if equal else better
     return Identification(stated, means, equal, stands, whole, possible, better)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
-from jaxslam.evaluation.causes import MAY, causes, suspect
+from jaxslam.evaluation.causes import MAY, causes, explained, suspect
 from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
@@ -27,7 +27,6 @@ from jaxslam.evaluation.inputs import (
 from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.io.text import vector_of
-from jaxslam.statistics.verdict import not_disproved
 
 
 def evaluate_poses(
@@ -76,14 +75,12 @@ def evaluate_poses(
     if identified.doubtful and found.most is not None and not suspect(found):
         identified = None  # correlations of errors may be what makes it doubtful
     if identified and open_still:
-        of = "the convention of the covariances"
-        if identified.doubtful and not identified.stands:
-            best = identified.nees[identified.consistent[0]]
-            why = (Mistake(f"{of} is another", identified.sentence, best),)
-        elif identified.possible is not None:
-            best, own = (identified.nees[x] for x in (identified.possible, poses.convention))
-            told = f"with {identified.possible} NEES is {best:.4g} instead of {own:.4g}"
-            why += (Mistake(f"{of}{MAY}be another", told, best),)
+        sure, of = identified.doubtful and not identified.stands, identified.nees
+        if (best := identified.consistent[0] if sure else identified.possible) is not None:
+            what = f"the convention of the covariances {'is' if sure else 'may be'} another"
+            told = f"with {best} NEES is {of[best]:.4g} instead of {of.get(stated, np.inf):.4g}"
+            cause = Mistake(what, identified.sentence if sure else told, of[best])
+            why = (cause,) if sure else (*why, cause)
     at = at[len(at) - found.steps :]
     return described(found, causes=why, times=at, timed=times is not None, identified=identified)
 
@@ -104,9 +101,8 @@ def _identified(poses: Poses, *, wrong: bool) -> Identification:
     flat = sum(name.startswith("r") for name in poses.used) < 2
     turned = stated.axes if stated.axes != "body" else "world"
     same = [c for c in alternatives(stated, geometry) if not flat or c.axes in ("body", turned)]
-    if stated.scale == "given" or poses.align != "none":
-        return identify(stated, tried(same))
-    given = [replace(convention, scale="given") for convention in same]
+    free = stated.scale != "given" and poses.align == "none"
+    given = [replace(convention, scale="given") for convention in same if free]
     return identify(stated, tried(same), lambda: tried(given))
 
 
@@ -123,7 +119,7 @@ def _tried(poses: Poses, *, wrong: bool) -> Tried:
     if poses.convention.axes == "rpy":  # angles that follow one another are not orthogonal
         N = turning(poses.convention, poses.estimates[poses.logged])
         volume -= 2 * float(np.linalg.slogdet(N)[1].mean())
-    right = wrong and not_disproved(found.of_nees)
+    right = wrong and explained(found)
     return Tried(found.nees, found.dof, found.fitted, volume, parts, right)
 
 

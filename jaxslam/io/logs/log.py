@@ -19,10 +19,7 @@ STEPS = (1e-3, 10.0)
 """The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
 """The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
-WHOLE = (
-    "a covariance of finite numbers, or of NaN alone where a pose has none; an axis that is not "
-    "estimated has the variance −1 at every pose"
-)
+WHOLE = "a covariance of finite numbers, or of NaN alone (an unknown axis has the variance −1)"
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
 

@@ -98,10 +98,9 @@ def meanings(titles: tuple[str, ...]) -> dict[str, int]:
     """The columns of `t`, `x`, `y`, `z`, `qx` … `qw`, `θ`, `roll`, `pitch`: the first of each, but
     of times that of a header. They may be in two, the second of which is `nano`."""
     found: dict[str, int] = {}
-    named = [words(title) for title in titles]
     # Beside an rw, rx is no position.
-    turns = {*_TURNS, "r"} if any(re.fullmatch(r"(.*_)?r_?w", x) for x in named) else _TURNS
-    for column, told in enumerate(named):
+    turns = (*_TURNS, *("r" for title in titles if re.fullmatch(r"(.*_)?r_?w", words(title))))
+    for column, told in enumerate(map(words, titles)):
         time = _TIME.fullmatch(told)
         what = time.lastgroup if time else "" if _spread(told) else _of_pose(told, turns)
         found.setdefault(what or "", column)
@@ -160,9 +159,8 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
     if not {(i, i) for i in range(3 - flat)} <= cells.keys():
         return None, NOTHING, False
     P = symmetric_or_none(table, np.column_stack([*cells.values()]), [*cells])
-    there = ~np.isnan(P[:, 0, 0])
     for i in {*range(6)} - {i for i, j in cells if i == j}:
-        P[there, i, i] = -1.0
+        P[~np.isnan(P[:, 0, 0]), i, i] = -1.0
     if flat:
         return P[:, [[0], [1], [5]], [0, 1, 5]], _ROS, False
     column = table.titles.index("est_err_type") if "est_err_type" in table.titles else -1
