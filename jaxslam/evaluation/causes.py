@@ -59,8 +59,7 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
     yield from _repeated(poses)
     if not suspect(found) or poses.convention.scale == "given":
         return
-    few = poses.some()
-    if few is not poses:
+    if (few := poses.some()) is not poses:
         poses, found = few, compared(few)
     turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
     told: list[Mistake] = []
@@ -69,9 +68,8 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
         if told and MAY not in told[-1].what:
-            told = told[-1:]
             break
-    yield from told
+    yield from [x for x in told if MAY not in x.what] or told
 
 
 def suspect(found: Evaluation) -> bool:
@@ -138,11 +136,11 @@ def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
         after = off(changed.estimates, changed.truths)
         fixed = compared(changed) if after < before else found
         # σ of rotations may be as large as what is left.
-        clear = after < before / 4 or len(there) >= FEWEST
-        far, right = before > np.radians(20), _right(fixed) and 10 * _nees(fixed) < _nees(found)
-        if right or (far and after < before / 4):
+        far, near, less = before > np.radians(20), after < before / 4, _nees(found) / _nees(fixed)
+        if (far and near and less > CLEARLY) or (less > 10 and _right(fixed)):
+            sure = " " if far and (near or len(there) >= FEWEST) else MAY
             return Mistake(
-                f"quaternions of the {name}{' ' if far and clear else MAY}have w first",
+                f"quaternions of the {name}{sure}have w first",
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
                 f"the {name} read as qw qx qy qz {_instead(fixed, found)}; write qx qy qz qw, or "
                 "name the columns",

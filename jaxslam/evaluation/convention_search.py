@@ -97,7 +97,7 @@ class Identification:
     whole: bool = False
     """Whether all axes together are: position or rotation alone may not be."""
     possible: Convention | None = None
-    """The best of those under which nothing shows that σ is too small."""
+    """The best of those that are better, and under which nothing shows that σ is too small."""
     better: tuple[Convention, int, int] | None = None
     """Where none makes the data consistent, the one that certainly fits better than the stated
     one, in how many runs, and of how many."""
@@ -186,10 +186,12 @@ def identify(
         finite |= free
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
     stands, whole = own is not None and own.consistent, own is not None and own.whole
-    # Not given the scale, of which a fit takes more than a wrong convention adds.
-    right = (c for c in finite.keys() & tried.keys() if finite[c].right)
-    possible, better = min(right, key=means.__getitem__, default=None), None if equal else better
-    return Identification(stated, means, equal, stands, whole, possible, better)
+    # Of covariances as large, on average; a fit of the scale takes more than a wrong convention.
+    size = {c: finite[c].log_determinant / finite[c].dof for c in finite.keys() & tried.keys()}
+    nees = {c: x + np.log(max(means[c], 1e-300)) for c, x in size.items() if finite[c].right}
+    most = size.get(stated, -np.inf) + np.log(means.get(stated, np.inf))
+    possible = min((c for c in nees if nees[c] < most), key=nees.__getitem__, default=None)
+    return Identification(stated, means, equal, stands, whole, possible, None if equal else better)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
