@@ -217,7 +217,7 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     for arm, gain in ((False, 1.5), (True, 1.2)):
         other = _mounted(poses, found, X, arm=arm)
         fixed = _without(poses, other)
-        if _nees(fixed) < _nees(best) / gain:
+        if _nees(fixed) < _nees(best) / gain or explained(best) < explained(fixed):
             best, X = fixed, other
     if best is found:
         return None

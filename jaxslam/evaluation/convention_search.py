@@ -187,10 +187,10 @@ def identify(
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
     stands, whole = own is not None and own.consistent, own is not None and own.whole
     # Of covariances as large, on average; a fit of the scale takes more than a wrong convention.
-    size = {c: finite[c].log_determinant / finite[c].dof for c in finite.keys() & tried.keys()}
-    nees = {c: x + np.log(max(means[c], 1e-300)) for c, x in size.items() if finite[c].right}
-    most = size.get(stated, -np.inf) + np.log(means.get(stated, np.inf))
-    possible = min((c for c in nees if nees[c] < most), key=nees.__getitem__, default=None)
+    fits = [(np.exp(x.log_determinant / x.dof) * means[c], c) for c, x in finite.items()]
+    own_fit = next((fit for fit, c in fits if c == stated), 0.0)
+    right = [(fit, c) for fit, c in fits if fit < own_fit and c in tried and finite[c].right]
+    possible = min(right, key=lambda x: x[0])[1] if right else None
     return Identification(stated, means, equal, stands, whole, possible, None if equal else better)
 
 

@@ -293,8 +293,7 @@ def _of_runs(
     if wrong and late is not None:
         with suppress(ValueError):  # an offset at which few poses have a truth is none of clocks
             found = _in_time(found, compared(at_offset(late.seconds)), late)
-        automatic |= late.found
-    if automatic:
+    if automatic or (wrong and late is not None and late.found):
         found = described(found, time_offset=late)
     told += _remarks(read)
     if (logs[0].estimate.assumed or not logs[0].estimate.said) and not stated:
@@ -304,13 +303,14 @@ def _of_runs(
 
 def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
     """The evaluation with the offset of the clocks as the cause, where NEES falls without it; and,
-    where that is less than chance, nothing else is wrong."""
+    where that is not certain, nothing else is wrong."""
     before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
-    if after >= before / CLEARLY or not (late.found or explained(fixed)):
+    certain = late.found and after < before / CLEARLY
+    if not certain and (after >= before or not explained(fixed)):
         return found
     error = float(f"{1e3 * late.sigma:.1g}")
     clock = Mistake(
-        f"the clocks of estimate and truth{' ' if late.found else MAY}differ",
+        f"the clocks of estimate and truth{' ' if certain else MAY}differ",
         f"the stamps of the estimate are {1e3 * late.seconds:.1f} ± {error:g} ms late, by its "
         f"rotations: with --time-offset {late.seconds:.4f} (or auto) NEES is {after:.4g} instead "
         f"of {before:.4g}",
