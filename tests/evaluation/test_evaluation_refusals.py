@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from logs import FIXED, drawn, logged, one_run, planar, tracked_run, write_runs
+from scipy.io import savemat
 
 import jaxslam
 from jaxslam.cli import main
@@ -350,3 +351,15 @@ def test_a_mistake_ends_the_command_with_status_2_and_one_line(tmp_path, capsys)
         assert (stop.value.code, error.count("\n")) == (2, 1)
         assert message in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", [99, 1 << 15])
+def test_a_mat_file_that_ends_the_process_which_reads_it_is_refused(kind, tmp_path):
+    """Of numbers of no known kind, which SciPy looks up beyond the end of a table."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"nees": np.ones((3, 30)), "dof": 3.0})
+    data, of_doubles = path.read_bytes(), np.array([9, 720], np.uint32).tobytes()
+    assert data.count(of_doubles) == 1
+    path.write_bytes(data.replace(of_doubles, np.array([kind, 720], np.uint32).tobytes()))
+    with pytest.raises(ValueError, match=r"a\.mat: cannot be read \(.*\); expected a mat file"):
+        evaluate_log(path)
