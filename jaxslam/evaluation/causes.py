@@ -82,8 +82,10 @@ def _right(found: Evaluation) -> bool:
 
 
 def explained(found: Evaluation) -> bool:
-    """Whether little is left to be wrong: nothing by the verdict, which may allow for much."""
-    return found.of_nees["word"] not in WORSE and _nees(found) < LESS * found.dof
+    """Whether nothing is left to be wrong by the verdict, which may allow for much, nor by what one
+    right pose in 200 reaches."""
+    # 2 n + 6 is the quantile of χ², for n from 1 to 6, of one in 150 to 200.
+    return found.of_nees["word"] not in WORSE and _nees(found) < 2 * found.dof + 6
 
 
 def _nees(found: Evaluation) -> float:
@@ -330,8 +332,6 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
     scale = np.array([2.0 if name.startswith("r") else 1.0 for name in poses.names])
     whole = poses._replace(covariances=scale[:, None] * poses.covariances * scale)
     fixed, certain = compared(whole), len(poses.logged) >= FEWEST
-    if not _right(fixed) or not explained(fixed):
-        return None
     parts = (tuple(x for x in found.names if x.startswith("r") == turn) for turn in (False, True))
     for names in filter(None, parts):
         if not explained(part := compared(whole._replace(used=names))):
@@ -339,6 +339,8 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
         off = np.log([part.axis_verdict(i)["sigma_factor"] or np.inf for i in range(len(names))])
         # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
         certain &= bool(abs(off.mean()) <= np.log(HALF) and np.ptp(off) <= 3 * np.log(HALF))
+    if not explained(fixed) or not (certain or _right(fixed)):
+        return None
     return Mistake(
         "half angles" if certain else f"the covariances{MAY}be of half angles",
         "σ of all rotations is half of the right one, and that of positions right, as if the "
