@@ -276,8 +276,11 @@ def displaced(T: np.ndarray, errors: np.ndarray, convention: Convention) -> np.n
     """Truths whose errors in a convention are these, poses (…, d, d)."""
     n = T.shape[-1] - 1
     own = np.linalg.solve(turning(convention, T), errors[..., None])[..., 0]
+    flat, count = own.reshape(-1, own.shape[-1]), own[..., 0].size
+    # Filled up to a power of two, so that few programs serve all sizes.
+    filled = np.resize(flat, (1 << (count - 1).bit_length(), flat.shape[-1]))
     with jax.enable_x64(True):
-        E = np.asarray(_exp(geometry_of(T), own.reshape(-1, own.shape[-1]))).reshape(T.shape)
+        E = np.asarray(_exp(geometry_of(T), filled))[:count].reshape(T.shape)
     if convention.error == "left":
         return E @ T
     if convention.error == "right":

@@ -574,6 +574,8 @@ LOGS = {
         "qw qz qx qy z status y x t",
         "q_w,q_z,q_x,q_y,pos_z [m],status,pos_y [m],pos_x [m],timestamp [s]\n",
     )),
+    "titles of a rotation, with w": Log(
+        trajectories("t qw qx qy qz x y z", "t,rw,rx,ry,rz,tx,ty,tz\n")),
     "titles of ROS' CSV": Log(trajectories(
         "seq x y z qx qy qz qw t",
         "%seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"

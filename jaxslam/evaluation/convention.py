@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, Log, in_seconds, symmetric
+from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, symmetric
 from jaxslam.io.logs.unnamed import is_deviations, without_values
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import write_table
@@ -319,7 +319,7 @@ def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False
     """The same, as a log without poses; those of `positions` may be of x, y, z alone."""
     table = read_table(path, "covariances", "covariances", "a time and finite numbers")
     rows, count = table.rows, table.rows.shape[1]
-    told, assumed, of_titles = named.covariances(table, flat=t == 3)
+    told, of_titles, assumed = named.covariances(table, flat=t == 3)
     alone = positions and told is None and count in (4, 7, 10)
     t = 3 if alone else t
     triangle = 1 + t * (t + 1) // 2
@@ -333,14 +333,14 @@ def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False
         kinds[count] = f"{count} finite numbers, OpenVINS's time and deviations"
     there, expected = ~without_values(rows), kinds.get(count, "; or ".join(kinds.values()))
     if told is None:
-        table.check(~np.isfinite(rows[:, 0]) | there & np.isnan(rows).any(axis=1), expected)
-        table.check([count not in kinds], expected)
-    said, unit = _said(table, MIXED if deviations else assumed)
+        table.check(~np.isfinite(rows[:, 0]) | [count not in kinds], expected)
+        table.check(there & np.isnan(rows).any(axis=1), WHOLE)
+    said, unit, stated = _said(table, MIXED if deviations else of_titles)
     P = np.full((len(rows), t, t), np.nan)
     time = 0 if told is None else named.meanings(table.titles).get("t", 0)
     times, notes = in_seconds(table, rows[:, time])
     if told is not None:
-        P, notes = told, (*notes, *of_titles)
+        P = told
     elif deviations or count == 1 + t:
         sigma = rows[there][:, [4, 5, 6, 1, 2, 3] if deviations else range(1, 1 + t)]
         for wrong in sigma[~((sigma >= 0) & (sigma <= LARGEST))][:1]:
@@ -354,7 +354,8 @@ def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False
     P = np.pad(P, ((0, 0), (0, 3), (0, 3))) if alone else P
     names = Convention(**said).names(SPATIAL if P.shape[-1] == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
-    return Log(times, np.empty((0, 4, 4)), scale[:, None] * P * scale, said, notes)
+    P, assumed = scale[:, None] * P * scale, assumed and not stated
+    return Log(times, np.empty((0, 4, 4)), P, said, notes, assumed=assumed)
 
 
 def _of_triangle(path: str | Path, values: np.ndarray, t: int) -> tuple[Squares, tuple[str, ...]]:
@@ -378,9 +379,9 @@ def _of_triangle(path: str | Path, values: np.ndarray, t: int) -> tuple[Squares,
     return by_column, (note,)
 
 
-def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], float]:
-    """The words of a convention in a header, and its unit of angles, in radians. Raises ValueError
-    for misspelt keys and unknown values."""
+def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], float, bool]:
+    """The words of a convention in a header, its unit of angles, in radians, and whether there are
+    any words. Raises ValueError for misspelt keys and unknown values."""
     told = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", " ".join(table.comments)))
     known = {**CHOICES, "angle": tuple(ANGLES), "length": ()}
     try:
@@ -394,4 +395,4 @@ def _said(table: Table, default: Mapping[str, str]) -> tuple[dict[str, str], flo
     except ValueError as error:
         raise ValueError(f"{table.path}: {error}") from None
     said = {key: value for key, value in told.items() if key in CHOICES}
-    return {**default, **said}, ANGLES[told.get("angle", "rad")]
+    return {**default, **said}, ANGLES[told.get("angle", "rad")], bool(said)

@@ -50,6 +50,8 @@ class Tried(NamedTuple):
     parts: Mapping[str, tuple[PerStep, int]] = MappingProxyType({})
     """The NEES of `position` and of `rotation` alone, where there are such axes, and their
     degrees of freedom."""
+    right: bool = False
+    """Whether nothing shows that σ is too small, by any test of the verdict."""
 
     def last(self, steps: int) -> Tried:
         """Return the same of the last steps alone."""
@@ -94,6 +96,8 @@ class Identification:
     """Whether the data are consistent with the stated one too, be another the better."""
     whole: bool = False
     """Whether all axes together are: position or rotation alone may not be."""
+    possible: Convention | None = None
+    """The best of those that are better, and under which nothing shows that σ is too small."""
     better: tuple[Convention, int, int] | None = None
     """Where none makes the data consistent, the one that certainly fits better than the stated
     one, in how many runs, and of how many."""
@@ -182,7 +186,12 @@ def identify(
         finite |= free
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
     stands, whole = own is not None and own.consistent, own is not None and own.whole
-    return Identification(stated, means, equal, stands, whole, None if equal else better)
+    # Of covariances as large, on average; a fit of the scale takes more than a wrong convention.
+    fits = [(np.exp(x.log_determinant / x.dof) * means[c], c) for c, x in finite.items()]
+    own_fit = next((fit for fit, c in fits if c == stated), 0.0)
+    right = [(fit, c) for fit, c in fits if fit < own_fit and c in tried and finite[c].right]
+    possible = min(right, key=lambda x: x[0])[1] if right else None
+    return Identification(stated, means, equal, stands, whole, possible, None if equal else better)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+import subprocess
+import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -12,7 +16,7 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.files import LARGEST, one_line, read_arrays
+from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam.evaluation.convention import (
     BLOCK,
     CHOICES,
@@ -420,19 +424,21 @@ def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
     return T
 
 
+_LOAD = "import pickle as p, sys, scipy.io as s; p.dump(s.loadmat(sys.argv[1]), sys.stdout.buffer)"
+"""A program that writes the arrays of a mat file."""
+
+
 def read_mat(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a mat file of MATLAB up to version 7; nothing in it is run."""
-    from scipy.io import loadmat  # slow to import
-
-    try:
-        found = loadmat(path)
-    except NotImplementedError:
-        raise ValueError(f"{path}: is of MATLAB 7.3; save it with -v7") from None
-    except Exception as error:  # of many kinds, as the library trusts its bytes
+    # SciPy trusts the bytes of a file: by damaged ones the process that reads them may end.
+    done = subprocess.run([sys.executable, "-c", _LOAD, path], capture_output=True, check=False)
+    if done.returncode:
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2] or "it is damaged"
         raise ValueError(
-            f"{path}: cannot be read ({one_line(error)}); expected a mat file"
-        ) from None
-    arrays = {name: value for name, value in found.items() if not name.startswith("__")}
+            f"{path}: cannot be read ({textwrap.shorten(last, 200)}); expected a mat file, up to "
+            "version 7 (save -v7)"
+        )
+    arrays = {k: x for k, x in pickle.loads(done.stdout).items() if not k.startswith("__")}
     for name in {"names", *CHOICES} & arrays.keys():  # cells, or a matrix of letters
         arrays[name] = np.array([str(np.ravel(x)[0]).strip() for x in arrays[name].ravel()])
     if "dof" in arrays and arrays["dof"].size == 1:

@@ -163,7 +163,7 @@ def read_run(run: RunFiles) -> RunLogs:
     if isinstance(run.estimate, ros.Topic) and run.covariance is None:
         P = _filled_in(run.estimate, P)
     unused = ~np.isin(np.arange(len(own.times)), of)
-    log = log._replace(covariances=P, said=own.said)
+    log = log._replace(covariances=P, said=own.said, assumed=own.assumed)
     return RunLogs(run, log, truth, own.times, unused, oriented, notes)
 
 

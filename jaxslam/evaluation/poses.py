@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
-from jaxslam.evaluation.causes import causes, suspect
+from jaxslam.evaluation.causes import MAY, causes, explained, suspect
 from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
@@ -69,39 +69,44 @@ def evaluate_poses(
     names = tuple(name for name in poses.names if name in used)
     found = compared(poses._replace(align=align, used=names, truth_sigma=sigma))
     poses = poses._replace(align=align, used=found.names, truth_sigma=sigma)
-    identified, why = _identified(poses), tuple(causes(poses, found))
+    why = tuple(causes(poses, found))
+    open_still = all(MAY in x.what for x in why)
+    identified = _identified(poses, wrong=suspect(found) and open_still)
     if identified.doubtful and found.most is not None and not suspect(found):
         identified = None  # correlations of errors may be what makes it doubtful
-    if not why and identified and identified.doubtful and not identified.stands:
-        best = identified.nees[identified.consistent[0]]
-        what = "the convention of the covariances is another"
-        why = (Mistake(what, identified.sentence, best),)
+    if identified and open_still:
+        sure, of = identified.doubtful and not identified.stands, identified.nees
+        if (best := identified.consistent[0] if sure else identified.possible) is not None:
+            what = f"the convention of the covariances {'is' if sure else 'may be'} another"
+            told = f"with {best} NEES is {of[best]:.4g} instead of {of.get(stated, np.inf):.4g}"
+            cause = Mistake(what, identified.sentence if sure else told, of[best])
+            why = (cause,) if sure else (*why, cause)
     at = at[len(at) - found.steps :]
     return described(found, causes=why, times=at, timed=times is not None, identified=identified)
 
 
-def _identified(poses: Poses) -> Identification:
-    """Identify the convention among those of the same scale; else among those given the scale."""
+def _identified(poses: Poses, *, wrong: bool) -> Identification:
+    """Identify the convention among those of the same scale; else among those given the scale. Of
+    errors that are `wrong` as stated, whether they are right is asked of each."""
     geometry, poses, stated = geometry_of(poses.estimates), poses.some(), poses.convention
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                result[convention] = _tried(poses._replace(convention=convention))
+                result[convention] = _tried(poses._replace(convention=convention), wrong=wrong)
         return result
 
     # With one axis of rotation mixed and rpy are world, as in the plane.
     flat = sum(name.startswith("r") for name in poses.used) < 2
     turned = stated.axes if stated.axes != "body" else "world"
     same = [c for c in alternatives(stated, geometry) if not flat or c.axes in ("body", turned)]
-    if stated.scale == "given" or poses.align != "none":
-        return identify(stated, tried(same))
-    given = [replace(convention, scale="given") for convention in same]
+    free = stated.scale != "given" and poses.align == "none"
+    given = [replace(convention, scale="given") for convention in same if free]
     return identify(stated, tried(same), lambda: tried(given))
 
 
-def _tried(poses: Poses) -> Tried:
+def _tried(poses: Poses, *, wrong: bool) -> Tried:
     """The NEES of a convention: of all axes, of the position and of the rotation alone."""
     e, P, logged, words = stated_errors(poses)
     found = of_steps(e, P, logged, **words)
@@ -114,7 +119,8 @@ def _tried(poses: Poses) -> Tried:
     if poses.convention.axes == "rpy":  # angles that follow one another are not orthogonal
         N = turning(poses.convention, poses.estimates[poses.logged])
         volume -= 2 * float(np.linalg.slogdet(N)[1].mean())
-    return Tried(found.nees, found.dof, found.fitted, volume, parts)
+    right = wrong and explained(found)
+    return Tried(found.nees, found.dof, found.fitted, volume, parts, right)
 
 
 def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:

@@ -123,7 +123,7 @@ class Evaluation:
 
         It is over-confident too where the scale drifts more than σ allows.
         """
-        found = self._of_nees
+        found = self.of_nees
         if self.mistakes:
             return withheld(found)
         if self.scale is None or not self.scale.disproved or found["word"] == "lost":
@@ -132,7 +132,8 @@ class Evaluation:
         return found | {"word": "over-confident", "p": p}
 
     @cached_property
-    def _of_nees(self) -> Verdict:
+    def of_nees(self) -> Verdict:
+        """The verdict of NEES alone, whatever mistakes there are."""
         with np.errstate(over="ignore"):
             z = self.errors / self.sigmas
             found = self._verdict(z, self.whitened, self.dof, self.fitted)
@@ -169,7 +170,7 @@ class Evaluation:
         """The verdict in a line."""
         if self.mistakes:
             return f"no verdict: {', '.join(mistake.what for mistake in self.mistakes)}"
-        told = headline(self._of_nees, self.quantity)
+        told = headline(self.of_nees, self.quantity)
         drifts = self.scale is not None and self.scale.disproved
         return f"{told}; {self.scale.sentence}" if drifts and self.scale else told
 
@@ -331,7 +332,7 @@ def _told(evaluation: Evaluation) -> str:
     if evaluation.mistakes:
         return "\n".join([evaluation.headline, *(x.told for x in evaluation.mistakes)])
     # Lost runs are named below, by their names here.
-    more = sentences(evaluation._of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
+    more = sentences(evaluation.of_nees | {"lost_runs": None}, evaluation.quantity)[1:]
     told, lost = [evaluation.headline, *more], evaluation.lost_runs
     if evaluation.scale is not None and not evaluation.scale.disproved:
         told.append(evaluation.scale.sentence)
@@ -371,7 +372,7 @@ def _as_json(evaluation: Evaluation) -> dict[str, Json]:
         "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
         "axis_verdict": {name: evaluation.axis_verdict(i) for i, name in names},
         "coverage": evaluation.coverage,
-        "effective_samples": evaluation._of_nees.get("effective"),
+        "effective_samples": evaluation.of_nees.get("effective"),
         "time_offset": evaluation.time_offset
         and dict(zip(("seconds", "sigma"), evaluation.time_offset, strict=True)),
         "causes": [
@@ -401,7 +402,7 @@ def _as_json(evaluation: Evaluation) -> dict[str, Json]:
 def described(found: Evaluation, **words: Any) -> Evaluation:
     """The same errors with other words about them, times, or causes."""
     result = replace(found, **words)
-    for name in ("_of_nees", "_axis_verdicts"):  # which take long, and are of errors alone
+    for name in ("of_nees", "_axis_verdicts"):  # which take long, and are of errors alone
         if name in found.__dict__:
             result.__dict__[name] = found.__dict__[name]
     return result

@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.files import LARGEST
+
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
@@ -49,9 +51,10 @@ class Table(NamedTuple):
             raise ValueError(f"{self.place(row)}: expected {expected}")
 
     def numbers(
-        self, expected: str, columns: Sequence[int] = (), *, spare: bool = True
+        self, expected: str, columns: Sequence[int] = (), *, spare: bool = True, none: bool = False
     ) -> Float[np.ndarray, "n m"]:
-        """Columns of finite numbers, by default all, and maybe `spare` ones.
+        """Columns of finite numbers up to `LARGEST`, by default all, and maybe `spare` ones; where
+        `none` is allowed, rows may be NaN but for the first number.
 
         `expected` is said in the ValueError for others.
         """
@@ -60,7 +63,10 @@ class Table(NamedTuple):
         if max(columns) >= count or not (spare or len(columns) == count):
             raise ValueError(f"{self.place(0)}: expected {expected}")
         found = self.rows[:, columns]
-        self.check(~np.isfinite(found).all(axis=1), expected)
+        without = none & np.isnan(found[:, 1:]).all(axis=1)
+        finite = np.isfinite(found[:, 0]) & (without | np.isfinite(found).all(axis=1))
+        self.check(~finite, expected)
+        self.check((np.abs(found) > LARGEST).any(axis=1), f"numbers up to {LARGEST:.0e}")
         return found
 
 
@@ -181,8 +187,8 @@ def _titles(lines: Sequence[str], count: int, separator: str | None) -> tuple[st
 
 
 def numbers(told: Sequence[str], count: int) -> list[float] | None:
-    """Read words as `count` finite numbers; None if they are not."""
-    found = [x for word in told if (x := _number(word)) is not None and math.isfinite(x)]
+    """Read words as `count` finite numbers up to `LARGEST`; None if they are not."""
+    found = [x for word in told if (x := _number(word)) is not None and abs(x) <= LARGEST]
     return found if len(found) == len(told) == count else None
 
 
@@ -193,7 +199,7 @@ def rows_of(
     line."""
     rows = {line: numbers(words, count) for line, words in told.items()}
     for line in (line for line, row in rows.items() if row is None):
-        raise ValueError(f"{path}, line {line}: expected {expected}")
+        raise ValueError(f"{path}, line {line}: expected {expected}, up to {LARGEST:.0e}")
     return np.array(list(rows.values())).reshape(-1, count)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from logs import FIXED, drawn, logged, one_run, planar, tracked_run, write_runs
 from refusals import ended, refused
+from scipy.io import savemat
 
 import jaxslam
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, read_covariances
@@ -184,6 +185,10 @@ OF_FILES = [
     (with_truth_sigma(np.nan, 1), "truth_sigma must be"),
     (covariances("0 1 2 3\n"), r"c\.txt, line 1: expected 22 finite numbers"),
     (covariances("# a\n" + "nan " * 22), r"c\.txt, line 2: expected 22 finite numbers"),
+    (
+        covariances("1 1 nan" + UPPER[5:]),
+        r"line 1: expected a covariance of finite numbers, or of NaN alone .* has the variance −1",
+    ),
     (covariances("# error=lfet\n" + UPPER), r"c\.txt: unknown error 'lfet' \(did you mean left\?"),
     (covariances("# eror=left\n" + UPPER), r"c\.txt: unknown key 'eror' in the header \(did you"),
     (covariances("# angle=grad\n" + UPPER), r"c\.txt: unknown angle 'grad'"),
@@ -276,6 +281,11 @@ OF_FOLDERS = [
      r"estimate\.txt: est_err_type is type3; expected one of type1, type2, type5"),
     (of_text("estimate.txt", "#%FORMAT SQUARE/0.3\n#%TIMESTAMP_UNIT weeks\n" + "1 " * 29),
      r"the header TIMESTAMP_UNIT is weeks; expected seconds or milliseconds or"),
+    (of_text("estimate.txt", "t,x,y,z,qx,qy,qz,qw,sx,sy,sz\n0,1,1,1,0,0,0,1,1,nan,1\n"),
+     r"estimate\.txt, line 2: expected a covariance of finite numbers, or of NaN alone"),
+    (of_text("estimate.txt", f"0 1 2 3 0 0 0 1 nan{20 * ' 0'}\n"), "line 1: .* or of NaN alone"),
+    (of_text("truth.txt", "0 1 2 0.5\n0 1 2 1e101\n"), r"line 2: expected numbers up to 1e\+100"),
+    (of_text("truth.txt", "VERTEX_SE2 0 1 2 1e101\n"), r"line 1: expected VERTEX.*up to 1e\+100"),
     (of_text("estimate.txt", "0 1 2 3 4 5\n"), r"line 1: 6 columns are no known format; expected"),
     (of_text("truth.txt", "a,t,b\n0,1,2\n"), r"line 2: 3 columns \(a, t, b\) are no known format"),
     (of_text("truth.txt", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"),
@@ -306,3 +316,15 @@ def test_a_mistake_ends_the_command_with_status_2_and_one_line(tmp_path, capsys)
         ("a.npz", "file", "cannot write there"),
     ):
         ended(message, ["evaluate", str(tmp_path / source)], tmp_path / out, capsys)
+
+
+@pytest.mark.parametrize("kind", [99, 1 << 15])
+def test_a_mat_file_that_ends_the_process_which_reads_it_is_refused(kind, tmp_path):
+    """Of numbers of no known kind, which SciPy looks up beyond the end of a table."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"nees": np.ones((3, 30)), "dof": 3.0})
+    data, of_doubles = path.read_bytes(), np.array([9, 720], np.uint32).tobytes()
+    assert data.count(of_doubles) == 1
+    path.write_bytes(data.replace(of_doubles, np.array([kind, 720], np.uint32).tobytes()))
+    with pytest.raises(ValueError, match=r"a\.mat: cannot be read \(.*\); expected a mat file"):
+        evaluate_log(path)

@@ -11,7 +11,7 @@ from scipy import stats
 import jaxslam
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, evaluate_poses
 from jaxslam.evaluation.convention import write_covariances
-from jaxslam.io.tum import write_tum
+from jaxslam.io.tum import quaternions, write_tum
 
 LOG = flight(np.random.default_rng(4), 1, 30)
 WANTED = evaluate_poses(LOG.estimates, LOG.covariances, LOG.truths, LOG.convention).nees
@@ -182,3 +182,48 @@ def test_the_estimate_of_a_folder_has_the_covariances_beside_it(tmp_path):
     other = estimate.rename(tmp_path / "other.txt")
     with pytest.raises(ValueError, match=r"other\.txt has no covariances; give them by --cov"):
         evaluate_log(other, truth=truth)
+
+
+WITHOUT = 3, 17
+"""Lines without a covariance."""
+
+
+@pytest.mark.parametrize("count", [3, 20, 21])
+def test_a_pose_without_a_covariance_in_its_line_is_left_out(count, tmp_path):
+    """Three σ of positions by titles, or so many numbers of a covariance: NaN alone."""
+    files(tmp_path)
+    T, P = LOG.estimates[0], np.diag([4e-4] * 6)
+    numbers = {
+        3: np.full(3, 0.02),
+        20: np.full(12, 0.0) + [4e-4, 0, 0, 4e-4, 0, 4e-4] * 2,
+        21: P[*np.triu_indices(6)],
+    }[count]
+    rows = np.column_stack([LOG.times, T[:, :3, 3], quaternions(T[:, :3, :3])])
+    rows = np.column_stack([rows, np.tile(numbers, (len(rows), 1))])
+    rows[WITHOUT, 8:] = np.nan
+    titles = "t,x,y,z,qx,qy,qz,qw,sx,sy,sz" * (count == 3)
+    (tmp_path / "covariance.txt").unlink()
+    np.savetxt(tmp_path / "estimate.txt", rows, header=titles, comments="", delimiter=",")
+    found = evaluate_log(tmp_path, stated={"error": "split", "axes": "world"})
+    assert "2 of 30 poses have no covariance within 0.01 s, and are left out" in found.notes
+    assert found.logged.sum() == 28
+    assert found.dof == (3 if count == 3 else 6)
+
+
+def test_a_convention_that_is_stated_is_not_said_to_be_assumed(tmp_path):
+    """By titles none is; but by a file of covariances, an option, or a header."""
+    files(tmp_path)
+    rows = np.column_stack([LOG.times, LOG.estimates[0, :, :3, 3], np.full((30, 3), 0.02)])
+    mine = tmp_path / "mine.csv"
+    np.savetxt(mine, rows, header="t,x,y,z,sx,sy,sz", comments="", delimiter=",")
+    own = tmp_path / "σ.csv"
+    np.savetxt(own, rows[:, [0, 4, 5, 6]], header="error=split\nt,sx,sy,sz", delimiter=",")
+
+    def assumed(**how):
+        found = evaluate_log(mine, truth=tmp_path / "truth.txt", **how)
+        return [x for x in found.notes if "assumed" in x or "taken as" in x]
+
+    assert len(assumed()) == 1
+    assert assumed(covariance=tmp_path / "covariance.txt") == []
+    assert assumed(covariance=own) == []
+    assert assumed(stated={"error": "split"}) == []

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxslam.io.text import Table
 from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
@@ -19,6 +19,7 @@ STEPS = (1e-3, 10.0)
 """The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
 """The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
+WHOLE = "a covariance of finite numbers, or of NaN alone (an unknown axis has the variance −1)"
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
 
@@ -50,6 +51,8 @@ class Log(NamedTuple):
     world: str = ""
     """The frame in which poses are, by its name; "" where it has none."""
     body: str = ""
+    assumed: bool = False
+    """Whether the words of its convention are, as its titles say none."""
 
 
 def log(
@@ -72,14 +75,8 @@ def log(
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if P is None else P
-    table.check(without_part(P), "a covariance of finite numbers")
     times, notes = in_seconds(table, rows[:, 0], unit)
     return Log(times, T, P, said, notes, oriented=oriented)
-
-
-def without_part(P: Rows) -> Bool[np.ndarray, " n"]:
-    """A mask of the matrices that lack some numbers, and not all."""
-    return np.asarray(np.isnan(P).any(axis=(1, 2)) & ~np.isnan(P).all(axis=(1, 2)))
 
 
 def planar(table: Table, rows: Rows, unit: str = "") -> Log:
@@ -153,6 +150,15 @@ def symmetric(
     rows, columns = np.transpose(places)
     P[:, rows, columns] = P[:, columns, rows] = values
     return P
+
+
+def symmetric_or_none(
+    table: Table, values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]] | np.ndarray
+) -> Float[np.ndarray, "n 6 6"]:
+    """The same; NaN throughout where all values are NaN. Raises ValueError where only some are."""
+    none = np.isnan(values).all(axis=1)
+    table.check(np.isnan(values).any(axis=1) & ~none, WHOLE)
+    return symmetric(values, places) + np.where(none, np.nan, 0.0)[:, None, None]
 
 
 def interpolated(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from jaxslam.io.logs.log import (
     Words,
     log,
     planar,
-    symmetric,
+    symmetric_or_none,
     unit_in,
-    without_part,
 )
 from jaxslam.io.text import Table
 
@@ -65,7 +64,7 @@ def read(table: Table) -> Log | None:
     times, unit = table.numbers(expected, [named["t"]]), unit_in(titles["t"])
     if "nano" in named and rows[:, named["nano"]].max() < 1e9:
         times, unit = times + 1e-9 * table.numbers(expected, [named["nano"]]), "s"
-    P, said, notes = covariances(table, flat=flat)
+    P, said, assumed = covariances(table, flat=flat)
     if flat:
         found = table.numbers(expected, [named[x] for x in "xyθ"])
         found[:, 2] *= _radians(titles["θ"])
@@ -77,10 +76,10 @@ def read(table: Table) -> Log | None:
         unit_of_angles = _radians("".join(titles.values()))
         turns = Rotation.from_euler("ZYX", unit_of_angles * yaw_pitch_roll).as_quat()
     if P is not None and not turns.shape[1]:
-        P[:, 3:, 3:] = 0.0
+        P[~np.isnan(P[:, 0, 0]), 3:, 3:] = 0.0
     places = rows[:, [named[x] for x in "xyz"]]
     found = log(table, np.column_stack([times, places, turns]), P, said, unit)
-    return found._replace(notes=(*found.notes, *notes))
+    return found._replace(assumed=assumed)
 
 
 def _radians(title: str) -> float:
@@ -99,9 +98,11 @@ def meanings(titles: tuple[str, ...]) -> dict[str, int]:
     """The columns of `t`, `x`, `y`, `z`, `qx` … `qw`, `θ`, `roll`, `pitch`: the first of each, but
     of times that of a header. They may be in two, the second of which is `nano`."""
     found: dict[str, int] = {}
+    # Beside an rw, rx is no position.
+    turns = (*_TURNS, *("r" for title in titles if re.fullmatch(r"(.*_)?r_?w", words(title))))
     for column, told in enumerate(map(words, titles)):
         time = _TIME.fullmatch(told)
-        what = time.lastgroup if time else "" if _spread(told) else _of_pose(told)
+        what = time.lastgroup if time else "" if _spread(told) else _of_pose(told, turns)
         found.setdefault(what or "", column)
     times = {x: found.pop(x) for x in ("header", "t", "nano") if x in found}
     if times:
@@ -109,14 +110,15 @@ def meanings(titles: tuple[str, ...]) -> dict[str, int]:
     return found | ({"nano": times["nano"]} if len(times) > 1 and "nano" in times else {})
 
 
-def _of_pose(told: str) -> str:
-    """What a title names of a pose: an axis, an angle, or a part of a quaternion."""
+def _of_pose(told: str, turns: Collection[str]) -> str:
+    """What a title names of a pose: an axis, an angle, or a part of a quaternion, with the names
+    of rotations."""
     *before, last = told.split("_")
     for word, axis in ((before[-1] if before else "", last), (last[:-1], last[-1:])):
+        if word in turns and axis in _TURNED:
+            return f"q{_TURNED[axis]}"
         if word in _PLACES and axis in _PLACED:
             return _PLACED[axis]
-        if word in _TURNS and axis in _TURNED:
-            return f"q{_TURNED[axis]}"
     return _ANGLES.get(last, "")
 
 
@@ -132,11 +134,12 @@ def _spread(told: str) -> re.Match[str] | None:
     return found if bool(alone) == bool(one) or (found["cov"] and alone) else None
 
 
-def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, tuple[str, ...]]:
-    """The covariances that titles name, words of their `Convention`, and notes: σ and variances by
-    axes, as `std_x` and `var_yaw`; pairs, as `pxy`; numbers, as `P12`, and `covariance7` of ROS;
-    and `qrp` of cnspy, with its kind of error. An axis without any has the variance −1. None where
-    no title names those of x and y and, unless all is `flat`, z. Raises ValueError."""
+def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]:
+    """The covariances that titles name, words of their `Convention`, and whether those are assumed:
+    σ and variances by axes, as `std_x` and `var_yaw`; pairs, as `pxy`; numbers, as `P12`, and
+    `covariance7` of ROS; and `qrp` of cnspy, with its kind of error. An axis without any has the
+    variance −1. None where no title names those of x and y and, unless all is `flat`, z. Raises
+    ValueError."""
     told = {i: x for i, title in enumerate(table.titles) if (x := _spread(words(title)))}
     places = iter(_places([x["number"] for x in told.values() if x["number"]]))
     cells, axes = {}, MIXED
@@ -154,13 +157,12 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, tuple
         axes = _ROS if found["cov"] and not names else axes
     cells.pop((6, 6), None)
     if not {(i, i) for i in range(3 - flat)} <= cells.keys():
-        return None, NOTHING, ()
-    P = symmetric(np.column_stack([*cells.values()]), [*cells])
-    table.check(without_part(P), "a covariance of finite numbers")
+        return None, NOTHING, False
+    P = symmetric_or_none(table, np.column_stack([*cells.values()]), [*cells])
     for i in {*range(6)} - {i for i, j in cells if i == j}:
-        P[:, i, i] = -1.0
+        P[~np.isnan(P[:, 0, 0]), i, i] = -1.0
     if flat:
-        return P[:, [[0], [1], [5]], [0, 1, 5]], _ROS, ()
+        return P[:, [[0], [1], [5]], [0, 1, 5]], _ROS, False
     column = table.titles.index("est_err_type") if "est_err_type" in table.titles else -1
     kinds = {*table.words.get(column, ())}
     if len(kinds) > 1 or not kinds <= _ERRORS.keys():
@@ -169,10 +171,8 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, tuple
             f"{', '.join(_ERRORS)} in all lines"
         )
     if kinds:
-        return P, _ERRORS[kinds.pop()], ()
-    taken = ", ".join(axes.values())
-    note = f"its titles do not say of which error its covariances are: taken as {taken}"
-    return P, axes, (note,)
+        return P, _ERRORS[kinds.pop()], False
+    return P, axes, True
 
 
 def _places(told: Sequence[str]) -> list[list[int]]:

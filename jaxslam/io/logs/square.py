@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from jaxslam.io.logs.log import Log, log, symmetric
+import numpy as np
+
+from jaxslam.io.logs.log import Log, log, symmetric_or_none
 from jaxslam.io.text import Table
 
 _KNOWN = {
@@ -35,7 +37,7 @@ def read(table: Table) -> Log | None:
                 f"{table.path}: the header {key} is {value}; expected {' or '.join(values)}"
             )
         said[key] = values[value]
-    P = symmetric(table.rows[:, 8:], [(i, j) for i in range(6) for j in range(i + 1)])
+    P = symmetric_or_none(table, table.rows[:, 8:], np.argwhere(np.tri(6)))
     convention = {"error": said["TANGENT_CONVENTION"], "order": said["TANGENT_ORDER"]}
     result = log(table, table.rows[:, :8], P, convention, said["TIMESTAMP_UNIT"])
     world, body = (headers.get(f"{x}_FRAME", "") for x in ("POSE", "BODY"))
