@@ -45,7 +45,8 @@ MOST = 2 / 3
 believed."""
 MISFIT = (0.7 / 6) ** 2
 """The variance from which on a window fits badly if it is also four times the median, pixels²: of
-first matches that do, a quarter were more than 2 pixels off, of others 1 % (docs/sequences.md)."""
+first matches that do, a quarter were more than 2 pixels off, of others 1 % (docs/sequences.md).
+Where nothing is proven yet, nothing contradicts them."""
 JERK = 4.0
 """σ of the accelerations of a camera that is jerked, in that of others: motions have tails."""
 LIVELY = 20.0
@@ -134,7 +135,8 @@ class Policy:
         agreed, variances = only(matches, chosen).first_of_each(rows)
         believed = np.isfinite(agreed[:, 0])
         fits = variances <= max(MISFIT, 4 * np.median(variances[believed] if chosen.size else 0))
-        believed &= fits | np.array([landmarks[slot].found > 0 for slot in seen.slots], bool)
+        found_before = np.array([landmarks[slot].found for slot in seen.slots], int)
+        believed &= fits | (found_before > 0) | (found_before.max(initial=0) >= PROVEN)
         if believed.sum() < least:
             believed[:] = False
         labels[believed] = "matched"
