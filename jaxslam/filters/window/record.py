@@ -40,7 +40,7 @@ class Record(eqx.Module):
     measured: Float[Array, "F m p"]
     """By slot of the landmark."""
     noise_factor: Float[Array, "F m"]
-    """Of each, as of `Features`."""
+    """κ of each, as in `Features`."""
     seen: Bool[Array, "F m"]
     first: Int[Array, " m"]
     """The frame in which a slot's landmark was first seen."""
