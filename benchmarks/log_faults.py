@@ -23,7 +23,6 @@ from verdicts import correlated, displaced
 
 from jaxslam.evaluation import Evaluation, evaluate_log, write_covariances
 from jaxslam.evaluation.alignment import Similarity
-from jaxslam.evaluation.causes import MAY
 from jaxslam.evaluation.convention import Convention, converted
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.io.tum import poses as poses_of
@@ -204,7 +203,7 @@ def judged(
     else:
         logs = log.estimates, log.covariances, log.truths
         found = evaluate_poses(*logs, log.convention, align=fault.align)
-    said = [x.what for x in found.mistakes if MAY not in x.what]
+    said = [x.what for x in found.mistakes if x.certain]
     if fault.word in " ".join([*said, *found.notes]) and fault.word:
         return "named", found
     if said:

@@ -32,8 +32,6 @@ from jaxslam.statistics.verdict import not_disproved
 
 ROUNDS, SMALL = 4, 1e-4
 """Steps of Gauss and Newton to the mounting, and those of its derivatives, in σ."""
-MAY = " may "
-"""A word of a cause without which nothing is wrong, but on no strong evidence."""
 UNDETERMINED = 0.05
 """The share of the largest singular value below which motion does not determine a direction."""
 CLEARLY = 1.5
@@ -67,9 +65,9 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
-        if told and MAY not in told[-1].what:
+        if told and told[-1].certain:
             break
-    yield from [x for x in told if MAY not in x.what] or told
+    yield from [x for x in told if x.certain] or told
 
 
 def suspect(found: Evaluation) -> bool:
@@ -140,13 +138,14 @@ def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
         # σ of rotations may be as large as what is left.
         far, near, less = before > np.radians(20), after < before / 4, _nees(found) / _nees(fixed)
         if (far and near and less > CLEARLY) or (less > 10 and _right(fixed)):
-            sure = " " if far and (near or len(there) >= FEWEST) else MAY
+            certain = bool(far and (near or len(there) >= FEWEST))
             return Mistake(
-                f"quaternions of the {name}{sure}have w first",
+                f"quaternions of the {name} {'' if certain else 'may '}have w first",
                 f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
                 f"the {name} read as qw qx qy qz {_instead(fixed, found)}; write qx qy qz qw, or "
                 "name the columns",
                 _nees(fixed),
+                certain,
             )
     return None
 
@@ -209,8 +208,9 @@ def _tilt(poses: Poses, found: Evaluation) -> Mistake | None:
     if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
         return None
     told = f"{why}: with --align {other} {_instead(fixed, found)}"
-    sure = "" if len(poses.logged) >= FEWEST else f"{MAY}be wrong"
-    return Mistake(f"an alignment by {poses.align}{sure}", told, _nees(fixed))
+    certain = len(poses.logged) >= FEWEST
+    what = f"an alignment by {poses.align}{'' if certain else ' may be wrong'}"
+    return Mistake(what, told, _nees(fixed), certain)
 
 
 def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
@@ -226,7 +226,8 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     moved = poses._replace(truths=poses.truths @ np.linalg.inv(X))
     n = len(X) - 1
     angle, metres = float(angles(X[:n, :n], np.eye(n))), float(np.linalg.norm(X[:n, n]))
-    certain = _of_body(poses, found, best, angle) or (_right(best) and _in_all_runs(X, moved))
+    certain = _of_body(poses, found, best, angle)
+    certain = bool(certain or (_right(best) and _in_all_runs(X, moved)))
     if not certain and not explained(best):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
@@ -240,10 +241,11 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     ]
     by_part = f" ({', '.join(alone)})" if len(alone) > 1 else ""
     return Mistake(
-        f"estimate and truth{' are ' if certain else f'{MAY}be '}of two bodies",
+        f"estimate and truth {'are' if certain else 'may be'} of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
         f"{_instead(best, found)}{by_part}; give the truth of the body that is estimated",
         _nees(best),
+        certain,
     )
 
 
@@ -342,9 +344,10 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
     if not explained(fixed) or not (certain or _right(fixed)):
         return None
     return Mistake(
-        "half angles" if certain else f"the covariances{MAY}be of half angles",
+        "half angles" if certain else "the covariances may be of half angles",
         "σ of all rotations is half of the right one, and that of positions right, as if the "
         f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
         f"header {_instead(fixed, found)}. If they are of angles, the filter is over-confident",
         _nees(fixed),
+        certain,
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
-from jaxslam.evaluation.causes import MAY, explained, suspect
+from jaxslam.evaluation.causes import explained, suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_csv
@@ -305,16 +305,17 @@ def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
     """The evaluation with the offset of the clocks as the cause, where NEES falls without it; and,
     where that is not certain, nothing else is wrong."""
     before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
-    certain = late.found and after < before / CLEARLY
+    certain = bool(late.found and after < before / CLEARLY)
     if not certain and (after >= before or not explained(fixed)):
         return found
     error = float(f"{1e3 * late.sigma:.1g}")
     clock = Mistake(
-        f"the clocks of estimate and truth{' ' if certain else MAY}differ",
+        f"the clocks of estimate and truth {'' if certain else 'may '}differ",
         f"the stamps of the estimate are {1e3 * late.seconds:.1f} ± {error:g} ms late, by its "
         f"rotations: with --time-offset {late.seconds:.4f} (or auto) NEES is {after:.4g} instead "
         f"of {before:.4g}",
         after,
+        certain,
     )
     return described(found, causes=(clock, *fixed.causes))
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
-from jaxslam.evaluation.causes import MAY, causes, explained, suspect
+from jaxslam.evaluation.causes import causes, explained, suspect
 from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
@@ -70,16 +70,16 @@ def evaluate_poses(
     found = compared(poses._replace(align=align, used=names, truth_sigma=sigma))
     poses = poses._replace(align=align, used=found.names, truth_sigma=sigma)
     why = tuple(causes(poses, found))
-    open_still = all(MAY in x.what for x in why)
+    open_still = not any(x.certain for x in why)
     identified = _identified(poses, wrong=suspect(found) and open_still)
     if identified.doubtful and found.most is not None and not suspect(found):
         identified = None  # correlations of errors may be what makes it doubtful
     if identified and open_still:
-        sure, of = identified.doubtful and not identified.stands, identified.nees
+        sure, of = bool(identified.doubtful and not identified.stands), identified.nees
         if (best := identified.consistent[0] if sure else identified.possible) is not None:
             what = f"the convention of the covariances {'is' if sure else 'may be'} another"
             told = f"with {best} NEES is {of[best]:.4g} instead of {of.get(stated, np.inf):.4g}"
-            cause = Mistake(what, identified.sentence if sure else told, of[best])
+            cause = Mistake(what, identified.sentence if sure else told, of[best], sure)
             why = (cause,) if sure else (*why, cause)
     at = at[len(at) - found.steps :]
     return described(found, causes=why, times=at, timed=times is not None, identified=identified)

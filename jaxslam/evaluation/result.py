@@ -376,7 +376,7 @@ def _as_json(evaluation: Evaluation) -> dict[str, Json]:
         "time_offset": evaluation.time_offset
         and dict(zip(("seconds", "sigma"), evaluation.time_offset, strict=True)),
         "causes": [
-            {"cause": x.what, "evidence": x.told, "nees_without": x.nees}
+            dict(zip(("cause", "evidence", "nees_without", "certain"), x, strict=True))
             for x in evaluation.mistakes
         ],
         "bias": bias

@@ -58,6 +58,8 @@ class Mistake(NamedTuple):
     """A sentence: where, by how much, and what to do."""
     nees: float | None = None
     """The mean NEES without it, where that was computed."""
+    certain: bool = True
+    """False of a cause that is only possible, as of few runs: nothing is wrong without it."""
 
 
 class Logged(NamedTuple):

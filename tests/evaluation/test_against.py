@@ -66,6 +66,7 @@ def test_the_file_and_the_table_for_latex(tmp_path, capsys):
     (cause,) = told["causes"]
     assert cause["cause"] == "the clocks of estimate and truth differ"
     assert cause["nees_without"] < 8
+    assert cause["certain"] is True
     assert cause["evidence"] in capsys.readouterr().out
     assert set(told["coverage"]) == {"50", "90", "99"}
     assert told["effective_samples"] > 1

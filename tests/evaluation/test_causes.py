@@ -192,3 +192,4 @@ def test_what_is_possible_is_told_with_the_nees_without_it():
     _, found = benchmark.judged("half angles", 1.0, 7, ONE)
     assert found.headline.startswith("no verdict: estimate and truth may be of two bodies, the cov")
     assert "with angle=half in their header NEES is" in found.mistakes[1].told
+    assert not any(x.certain for x in found.mistakes)

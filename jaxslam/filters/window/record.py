@@ -83,18 +83,12 @@ class Record(eqx.Module):
 
 def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: DTypeLike) -> Record:
     """The record of a frame 0 in which nothing has been seen yet."""
-    still = motion.still(dtype)
-    return Record(
-        jnp.zeros((), int),
-        jax.tree.map(lambda x: jnp.tile(x, (frames - 1, *(1,) * x.ndim)), still),
-        jnp.ones(frames - 1, dtype),
-        jnp.zeros(frames - 1, bool),
-        jnp.ones((), bool),
-        jnp.zeros((frames, landmarks, p), dtype),
-        jnp.ones((frames, landmarks), dtype),
-        jnp.zeros((frames, landmarks), bool),
-        jnp.zeros(landmarks, int),
-    )
+    still = jax.tree.map(lambda x: jnp.tile(x, (frames - 1, *(1,) * x.ndim)), motion.still(dtype))
+    ones, no = jnp.ones(frames - 1, dtype), jnp.zeros(frames - 1, bool)
+    measured, alike = jnp.zeros((frames, landmarks, p), dtype), jnp.ones((frames, landmarks), dtype)
+    seen, first = jnp.zeros((frames, landmarks), bool), jnp.zeros(landmarks, int)
+    last, standing = jnp.zeros((), int), jnp.ones((), bool)
+    return Record(last, still, ones, no, standing, measured, alike, seen, first)
 
 
 def stepped(record: Record, control: Control, seen: Features, noise: Float[Array, "p p"]) -> Record:
