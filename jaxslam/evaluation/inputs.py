@@ -424,8 +424,9 @@ def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
     return T
 
 
-_LOAD = "import pickle as p, sys, scipy.io as s; p.dump(s.loadmat(sys.argv[1]), sys.stdout.buffer)"
-"""A program that writes the arrays of a mat file."""
+_LOAD = """import faulthandler, pickle, sys, scipy.io; faulthandler.dump_traceback_later(99, exit=1)
+pickle.dump(scipy.io.loadmat(sys.argv[1]), sys.stdout.buffer)"""
+"""A program that writes the arrays of a mat file, within 99 s."""
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:
