@@ -176,7 +176,7 @@ def _worlds(poses: Poses, found: Evaluation) -> Mistake | None:
     by = "sim3" if scaled < left / LESS else by
     fixed, body = compared(poses._replace(align=by)), _mounting(poses, found)
     if body and (body.nees or 0.0) < CLEARLY * max(_nees(fixed), found.dof):
-        return body
+        return None  # that is told in its turn
     return Mistake(
         "estimate and truth are not in one world",
         f"positions differ by {rms:.3g} m (RMS) and by {left:.3g} m once aligned, by "

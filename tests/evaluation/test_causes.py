@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from verdicts import displaced
 
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_poses
+from jaxslam.evaluation.sanity_checks import Mistake
 
 SPLIT = Convention("split", "world")
 STEPS = 25
@@ -193,3 +194,10 @@ def test_what_is_possible_is_told_with_the_nees_without_it():
     assert found.headline.startswith("no verdict: estimate and truth may be of two bodies, the cov")
     assert "with angle=half in their header NEES is" in found.mistakes[1].told
     assert not any(x.certain for x in found.mistakes)
+
+
+def test_a_body_that_explains_as_much_as_another_world_is_told_once(monkeypatch):
+    body = Mistake("a body", "It explains all.", 1.0, certain=False)
+    monkeypatch.setattr("jaxslam.evaluation.causes._mounting", lambda *_: body)
+    _, found = benchmark.judged("another world", 1.0, 0, ONE)
+    assert found.mistakes.count(body) == 1
