@@ -125,11 +125,12 @@ def _calibration(
 ) -> Calibration:
     """The user's, or the layout's, or a guess."""
     if file:
-        return _of_pictures(str(file), read_calibration(file), width, height)
+        return _of_pictures(str(file), read_calibration(file, (width, height)), width, height)
     if fov is not None:
         return from_field_of_view(width, height, fov)
     if recording.calibration is not None:
-        return recording.calibration(width, height)
+        own = recording.calibration(width, height)
+        return _of_pictures(f"{recording.name}: its calibration", own, width, height)
     warnings.warn(
         f"{recording.name} has no calibration: a horizontal field of view of "
         f"{GUESSED_FIELD_OF_VIEW:g}° is guessed, and the lens estimated. Better: give a "

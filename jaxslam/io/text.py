@@ -206,7 +206,7 @@ def rows_of(
 def numbers_of(told: object) -> list[float]:
     """The numbers of a word, or of a list of any depth; none of anything else."""
     if isinstance(told, str):
-        words = told.strip("[]").replace(",", " ").split()
+        words = re.sub(r"[][,]", " ", told).split()
         return numbers(words, len(words)) or []
     try:
         return np.asarray(told, float).ravel().tolist() if told is not None else []
