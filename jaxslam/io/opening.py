@@ -16,7 +16,7 @@ from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
 from jaxslam.io.kitti import KITTI
 from jaxslam.io.lens_files import read_calibration
-from jaxslam.io.recording import PLAIN, TIMESTAMPED, Recording
+from jaxslam.io.recording import PLAIN, TIMESTAMPED, Recording, image_files
 from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
 from jaxslam.io.source import Source, Trajectory, check_size, resized, selected
@@ -91,7 +91,9 @@ def _found(path: Path) -> str:
     if not path.is_dir():
         return f"a file {path.suffix or 'without a suffix'}"
     names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]
-    return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}"
+    inner = [x.name for x in sorted(path.iterdir()) if x.is_dir() and image_files(x)]
+    hint = f" (pictures are in {', '.join(inner[:5])}: give one of these)" if inner else ""
+    return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}{hint}"
 
 
 def _scale_for(name: str, width: int, height: int) -> float:

@@ -1,9 +1,19 @@
 """Pictures as people have them, made what the tracker looks at: grey, 8 bits."""
 
+import functools
+import re
+import struct
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
+
+Deep = Iterable[np.ndarray]
+"""Grey pictures of 8 bits or more."""
 
 _ACCEPTED = (
     "a picture is uint8, or floats from 0 to 1, of shape (height, width) or (height, width, 3)"
@@ -33,3 +43,50 @@ def _in_bytes(array: np.ndarray) -> np.ndarray:
     if not np.all((array >= 0) & (array <= 1)):
         raise ValueError(f"{_ACCEPTED}, not floats from {array.min():g} to {array.max():g}")
     return np.rint(255 * array).astype(np.uint8)
+
+
+def in_bytes(
+    name: str, pictures: Callable[[], Deep], some: Callable[[], Deep]
+) -> Callable[[], Iterator[UInt8[np.ndarray, "height width"]]]:
+    """Pictures with 8 bits: those that have no more as they are, of others the upper 8 bits.
+
+    Where `some` of the pictures use less than half of 16 bits, as those of a thermal camera do, all
+    are stretched by one gain about their means, which drift as the sensor warms, with a warning.
+    """
+
+    @functools.cache
+    def levels() -> tuple[float, float]:
+        about = [x.ravel()[::7] - x.mean() for x in some()]
+        low, high = np.percentile(np.concatenate(about), (0.5, 99.5)).tolist()
+        if 0 < high - low < 2**15:
+            told = f"more than 8 bits, of which {high - low:.0f} grey levels are used"
+            warnings.warn(f"{name}: pictures have {told}; these are made 256", stacklevel=2)
+        return low, high - low
+
+    def of_bytes(picture: np.ndarray) -> UInt8[np.ndarray, "height width"]:
+        if picture.dtype == np.uint8:
+            return picture
+        low, spread = levels()
+        if not 0 < spread < 2**15:
+            return np.uint8(np.clip(picture / 256, 0, 255))
+        return np.uint8(np.clip((picture - picture.mean() - low) * (255 / spread), 0, 255))
+
+    return lambda: map(of_bytes, pictures())
+
+
+def orientation(path: Path) -> int:
+    """The orientation (EXIF, 1 to 8) in which a JPEG is to be shown; 1 where it states none."""
+    with path.open("rb") as file:
+        head = file.read(2**16)
+    found = re.search(rb"Exif\0\0(?=II|MM)", head)
+    if found is None:
+        return 1
+    tiff = head[found.end() :]
+    order = "<" if tiff[:1] == b"I" else ">"
+    try:
+        (at,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (count,) = struct.unpack_from(f"{order}H", tiff, at)
+        told = [struct.unpack_from(f"{order}HHIH", tiff, at + 2 + 12 * i) for i in range(count)]
+    except struct.error:
+        return 1
+    return next((value for tag, _, _, value in told if tag == 0x0112), 1)
