@@ -194,8 +194,8 @@ def lens(names: Sequence[str], distortion: Sequence[float]) -> tuple[str, tuple[
         which += f" of {len(told)} numbers" * bool(told)
         raise ValueError(
             f"unknown lens, {which}; expected plumb_bob (radtan), "
-            "rational_polynomial or equidistant (fisheye); undistort the pictures, or calibrate "
-            "anew (jaxslam calibrate)"
+            "rational_polynomial (8 numbers) or equidistant (fisheye); undistort the pictures, or "
+            "calibrate anew (jaxslam calibrate)"
         )
     if model != "fisheye":  # a rational polynomial of zeros is a pinhole's
         model = "rational" if any(told[5:]) else "pinhole"
