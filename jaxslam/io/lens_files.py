@@ -11,8 +11,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from jaxslam._runtime.files import one_line
 from jaxslam.io.calibration import MODELS, Calibration, from_fields
-from jaxslam.io.text import numbers, numbers_of, text_lines
+from jaxslam.io.text import numbers_of, text_lines
 
 Size = tuple[int, int] | None
 """Width and height of the pictures, where they are known."""
@@ -21,7 +22,7 @@ _CALLED = {
         brown_conrady simple_pinhole simple_radial radial""",
     "rational": "rational_polynomial rational radtan8 full_opencv",
     "fisheye": """equidistant equi fisheye kannala_brandt kannalabrandt8 kannala_brandt4 kb4
-        opencv_fisheye""",
+        opencv_fisheye radial_fisheye simple_radial_fisheye""",
 }
 _MODELS = {name: model for model, names in _CALLED.items() for name in names.split()}
 """Our models by what programs call cameras and their distortion; "" of OpenCV's numbers, which are
@@ -38,7 +39,12 @@ _MATRIX = (
     "camera_matrix", "k", "intrinsics", "camera", "intrinsic_matrix", "intrinsicmatrix", "p0",
     "mtx",
 )  # fmt: skip
-_NUMBERS = (("fx", "fl_x", "mu"), ("fy", "fl_y", "mv"), ("cx", "ppx", "u0"), ("cy", "ppy", "v0"))
+_NUMBERS = (
+    ("fx", "fl_x", "mu"),
+    ("fy", "fl_y", "mv", "fl_x"),
+    ("cx", "ppx", "u0"),
+    ("cy", "ppy", "v0"),
+)
 _DISTORTION = (
     "distortion_coefficients", "distortion_coeffs", "dist_coeff", "dist_coeffs", "d",
     "distortion.parameters", "distortion", "coeffs", "dist",
@@ -46,12 +52,14 @@ _DISTORTION = (
 _BENDS = re.compile(r"d|dist|.*distortion.*|.*coeff.*|[kp]\d|xi")
 """The last part of a key of what bends pictures: one that is not read is not passed over."""
 _PART = ("x_offset", "y_offset", "roi.width", "roi.height", "binning_x", "binning_y")
+_SIMPLE, _OPENCV = "fl_x cx cy", "fl_x fl_y cx cy k1 k2"
 _COLMAP = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
-    "FULL_OPENCV": 12, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8,
+    "SIMPLE_PINHOLE": _SIMPLE, "PINHOLE": "fl_x fl_y cx cy", "OPENCV": f"{_OPENCV} p1 p2",
+    **{x: f"{_SIMPLE} k1" for x in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE")},
+    **{x: f"{_SIMPLE} k1 k2" for x in ("RADIAL", "RADIAL_FISHEYE")},
+    "FULL_OPENCV": f"{_OPENCV} p1 p2 k3 k4 k5 k6", "OPENCV_FISHEYE": f"{_OPENCV} k3 k4",
 }  # fmt: skip
-"""How many parameters COLMAP's models have: focal lengths, one of simple and radial ones, centre
-and distortion."""
+"""The parameters of COLMAP's models by nerfstudio's keys, which are of the same pixels."""
 ACCEPTED = (
     "JSON with model, width, height, fx, fy, cx, cy, distortion; YAML, JSON or XML of OpenCV, ROS, "
     "Kalibr, EuRoC, ORB-SLAM, VINS, Basalt, RealSense or nerfstudio; COLMAP's cameras.txt (of "
@@ -129,7 +137,7 @@ def of_keys(fields: dict[str, object], size: Size = None, what: object = "") -> 
         raise ValueError(
             f"has no camera matrix of finite numbers, and no fx, fy, cx, cy; its keys are {known}"
         )
-    corner = 0.5 if any(x.endswith("fl_x") for x in read) else 0.0  # of COLMAP's pixels
+    corner = 0.5 * any(x.endswith("fl_x") for x in read)  # COLMAP's pixels begin there
     matrix = [*matrix[:2], *(x - corner for x in matrix[2:])]
     flags = first(("fisheye_model", "is_fisheye")) == [1.0]
     names += ["fisheye"] * (flags or any("fisheye" in x.rpartition(".")[0] for x in read))
@@ -203,64 +211,42 @@ def lens(names: Sequence[str], distortion: Sequence[float]) -> tuple[str, tuple[
 
 
 def _of_colmap(path: Path, lines: Sequence[str], size: Size) -> Calibration:
-    """The only camera, or that of pictures of this size; its pixels begin at the corner of the
-    first one, ours in its middle."""
+    """The only camera, or that of pictures of this size."""
     cameras = [line.split()[1:] for line in lines if line[0].isdigit()]
     fit = [x for x in cameras if size is not None and x[1:3] == [str(n) for n in size]] or cameras
     if len(fit) > 1:
         told = f"{path} has {len(cameras)} cameras, of which the first"
         warnings.warn(f"{told} {'of this size ' * (fit != cameras)}is taken", stacklevel=4)
     name, *told = fit[0]
-    values = numbers(told, len(told)) or []
-    if len(values) != 2 + _COLMAP.get(name, -2):
+    keys = f"width height {_COLMAP.get(name, '')}".split()
+    if len(told) != len(keys) or name not in _COLMAP:
         known = ", ".join(_COLMAP)
         raise ValueError(f"unknown camera model {name} of {len(told)} numbers; known: {known}")
-    width, height, focal, *rest = values
-    square = [focal] if name.startswith(("SIMPLE", "RADIAL")) else []
-    fx, fy, cx, cy, *distortion = [*square, focal, *rest]
-    names = ["fisheye"] if name.endswith("FISHEYE") else []
-    model, distortion = lens(names, [*distortion, 0.0, 0.0, 0.0])
-    size = int(width), int(height)
-    return Calibration(*size, fx, fy, cx - 0.5, cy - 0.5, distortion=distortion, model=model)
+    return of_keys({"model": name, **dict(zip(keys, told, strict=True))})
 
 
 def yaml_keys(text: str) -> dict[str, object]:
-    """The keys, of nested ones joined by dots, and their numbers, lists or words; what such files
-    have of YAML, and the first of several cameras or IMUs."""
-    text = re.sub(r"\[(?:[^][]|\[[^][]*\])*\]", lambda x: " ".join(x[0].split()), text)
-    text = re.sub(r"^( *)(.*:) *\{(.*)\}", _unfolded, text, flags=re.MULTILINE)
-    whole: dict[str, str] = {}
-    above: list[tuple[int, str]] = []
-    for line in text.splitlines():
-        name = ".".join(x for _, x in above)
-        if (row := re.fullmatch(r"\s*(?:-\s+)+\[?([-+.,\deE\s]+)\]?\s*(?:#.*)?", line)) and name:
-            whole[name] = f"{whole.get(name, '')} {row[1]}"  # of a list or a matrix
-        found = re.fullmatch(r"(\s*)([\w./-]+)\s*:(?:\s+(.*?))?\s*(?:#.*)?", line)
-        if found is None:
-            continue
-        indent, key, value = len(found[1]), found[2], re.sub(r"^!!\S+", "", found[3] or "").strip()
-        above = [x for x in above if x[0] < indent]
-        if value:
-            whole.setdefault(".".join([*(x for _, x in above), key]), value.strip("\"'"))
-        else:
-            above.append((indent, key))
-    fields: dict[str, object] = {}
-    for name, value in whole.items():
-        fields.setdefault(re.sub(r"(^|\.)([Cc]am(?:era)?|imu)\d+\.", r"\1", name), value)
-    return fields
+    """The keys of YAML, of nested ones joined by dots, and their numbers, lists or words; of the
+    first of several cameras or IMUs. Raises ValueError for what is no YAML."""
+    import yaml
 
-
-def _unfolded(row: re.Match[str]) -> str:
-    """`key: {a: 1, b: [2, 3]}` as lines of their own."""
-    parts = re.split(r",(?![^[]*\])", row[3])
-    return "\n".join([row[1] + row[2], *(f"{row[1]}  {part.strip()}" for part in parts)])
+    # OpenCV's directive and types are its own.
+    told = re.sub(r"^%.*|!!\S+", "", text, flags=re.MULTILINE).expandtabs()
+    try:
+        fields = next(iter(yaml.safe_load_all(told)), None)
+    except yaml.YAMLError as error:
+        raise ValueError(f"not a YAML file ({one_line(error)})") from None
+    result: dict[str, object] = {}
+    for name, value in _flat(fields if isinstance(fields, dict) else {}).items():
+        result.setdefault(re.sub(r"(^|\.)([Cc]am(?:era)?|imu)\d+\.", r"\1", name), value)
+    return result
 
 
 def _tree(element: ElementTree.Element) -> dict[str, object]:
     return {x.tag: _tree(x) if len(x) else x.text for x in element}
 
 
-def _flat(fields: dict[str, object], before: str = "") -> dict[str, object]:
+def _flat(fields: dict[object, object], before: str = "") -> dict[str, object]:
     """Nested keys joined by dots; of a list of objects the first one's."""
     result: dict[str, object] = {}
     for key, value in fields.items():

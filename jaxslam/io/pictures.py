@@ -2,7 +2,6 @@
 
 import functools
 import re
-import struct
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -12,6 +11,10 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
+_ORIENTATION = re.compile(
+    rb"Exif\0\0.*?(?:\x12\x01\x03\0\x01\0\0\0(.)\0|\x01\x12\0\x03\0\0\0\x01\0(.))", re.DOTALL
+)
+"""The entry of a JPEG's EXIF: its tag, its kind, one of it, and the orientation, in both orders."""
 Deep = Iterable[np.ndarray]
 """Grey pictures of 8 bits or more."""
 
@@ -77,16 +80,5 @@ def in_bytes(
 def orientation(path: Path) -> int:
     """The orientation (EXIF, 1 to 8) in which a JPEG is to be shown; 1 where it states none."""
     with path.open("rb") as file:
-        head = file.read(2**16)
-    found = re.search(rb"Exif\0\0(?=II|MM)", head)
-    if found is None:
-        return 1
-    tiff = head[found.end() :]
-    order = "<" if tiff[:1] == b"I" else ">"
-    try:
-        (at,) = struct.unpack_from(f"{order}I", tiff, 4)
-        (count,) = struct.unpack_from(f"{order}H", tiff, at)
-        told = [struct.unpack_from(f"{order}HHIH", tiff, at + 2 + 12 * i) for i in range(count)]
-    except struct.error:
-        return 1
-    return next((value for tag, _, _, value in told if tag == 0x0112), 1)
+        found = _ORIENTATION.search(file.read(2**16))
+    return (found[1] or found[2])[0] if found else 1
