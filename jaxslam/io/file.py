@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.pictures import as_grey, in_bytes
+from jaxslam.io.pictures import as_grey, of_eight_bits
 from jaxslam.io.recording import Layout, Recording
 
 _GREY_16 = int.from_bytes(b"Y1\0\x10", "little")
@@ -22,10 +22,10 @@ VIDEO_TYPES = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".mpg", ".mpeg")
 def _open(path: Path, _rate: float) -> Recording:
     times = read_times(path)
 
-    def some() -> Iterator[np.ndarray]:
-        return itertools.islice(_images(path), 0, None, len(times) // 16 + 1)
+    def images(every: int) -> Iterator[np.ndarray]:
+        return itertools.islice(_images(path), 0, None, every)
 
-    return Recording(path.name, times, in_bytes(path.name, lambda: _images(path), some))
+    return Recording(path.name, times, of_eight_bits(path.name, images, len(times)))
 
 
 def read_times(path: Path) -> Float[np.ndarray, " n"]:

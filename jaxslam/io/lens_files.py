@@ -3,6 +3,7 @@ use, COLMAP's `cameras.txt`, and a matrix alone."""
 
 import json
 import re
+import tomllib
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,54 +13,19 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxslam._runtime.files import one_line
-from jaxslam.io.calibration import MODELS, Calibration, from_fields
+from jaxslam.io.calibration import INTRINSICS, MODELS, Calibration, from_fields
 from jaxslam.io.text import numbers_of, text_lines
 
 Size = tuple[int, int] | None
 """Width and height of the pictures, where they are known."""
-_CALLED = {
-    "": """pinhole plumb_bob radtan radial-tangential opencv none perspective rectified
-        brown_conrady simple_pinhole simple_radial radial""",
-    "rational": "rational_polynomial rational radtan8 full_opencv",
-    "fisheye": """equidistant equi fisheye kannala_brandt kannalabrandt8 kannala_brandt4 kb4
-        opencv_fisheye radial_fisheye simple_radial_fisheye""",
-}
-_MODELS = {name: model for model, names in _CALLED.items() for name in names.split()}
-"""Our models by what programs call cameras and their distortion; "" of OpenCV's numbers, which are
-rational where they are more than five."""
-_NAMES = (
-    "camera_model", "camera.type", "camera.model", "model_type", "camera_type", "model",
-    "distortion_model", "distortion.type",
-)  # fmt: skip
-_SIZE = (
-    ("resolution", "image_size", "img_size"), ("width", "image_width", "camera.cols", "w"),
-    ("height", "image_height", "camera.rows", "h"),
-)  # fmt: skip
-_MATRIX = (
-    "camera_matrix", "k", "intrinsics", "camera", "intrinsic_matrix", "intrinsicmatrix", "p0",
-    "mtx",
-)  # fmt: skip
-_NUMBERS = (
-    ("fx", "fl_x", "mu"),
-    ("fy", "fl_y", "mv", "fl_x"),
-    ("cx", "ppx", "u0"),
-    ("cy", "ppy", "v0"),
-)
-_DISTORTION = (
-    "distortion_coefficients", "distortion_coeffs", "dist_coeff", "dist_coeffs", "d",
-    "distortion.parameters", "distortion", "coeffs", "dist",
-)  # fmt: skip
+_WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+_KEYS, _COLMAP = _WORDS["keys"], _WORDS["colmap"]
+_MODELS = {name: model for model, names in _WORDS["models"].items() for name in names}
+"""Our models by what programs call cameras and their distortion; `pinhole` of OpenCV's numbers,
+which are rational where they are more than five."""
 _BENDS = re.compile(r"d|dist|.*distortion.*|.*coeff.*|[kp]\d|xi")
 """The last part of a key of what bends pictures: one that is not read is not passed over."""
 _PART = ("x_offset", "y_offset", "roi.width", "roi.height", "binning_x", "binning_y")
-_SIMPLE, _OPENCV = "fl_x cx cy", "fl_x fl_y cx cy k1 k2"
-_COLMAP = {
-    "SIMPLE_PINHOLE": _SIMPLE, "PINHOLE": "fl_x fl_y cx cy", "OPENCV": f"{_OPENCV} p1 p2",
-    **{x: f"{_SIMPLE} k1" for x in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE")},
-    **{x: f"{_SIMPLE} k1 k2" for x in ("RADIAL", "RADIAL_FISHEYE")},
-    "FULL_OPENCV": f"{_OPENCV} p1 p2 k3 k4 k5 k6", "OPENCV_FISHEYE": f"{_OPENCV} k3 k4",
-}  # fmt: skip
-"""The parameters of COLMAP's models by nerfstudio's keys, which are of the same pixels."""
 ACCEPTED = (
     "JSON with model, width, height, fx, fy, cx, cy, distortion; YAML, JSON or XML of OpenCV, ROS, "
     "Kalibr, EuRoC, ORB-SLAM, VINS, Basalt, RealSense or nerfstudio; COLMAP's cameras.txt (of "
@@ -125,12 +91,11 @@ def of_keys(fields: dict[str, object], size: Size = None, what: object = "") -> 
                 return found
         return []
 
-    matrix = _pinhole(first(_MATRIX)) or [x for names in _NUMBERS for x in first(names)[:1]]
+    matrix = _pinhole(first(_KEYS["matrix"]))
+    matrix = matrix or [x for name in INTRINSICS for x in first(_KEYS[name])[:1]]
     place = read[0] if read else ""
-    names = [
-        str(told[key]) for key in keys
-        if any(f".{key}".endswith(f".{x}") and place.startswith(key[: -len(x)]) for x in _NAMES)
-    ]  # fmt: skip
+    named = ((key, x) for key in keys for x in _KEYS["name"] if f".{key}".endswith(f".{x}"))
+    names = [str(told[key]) for key in {k: 0 for k, x in named if place.startswith(k[: -len(x)])}]
     lens(names, ())  # of which no camera matrix need be known
     if len(matrix) != 4:
         known = ", ".join(list(fields)[:12]) or "none"
@@ -139,19 +104,20 @@ def of_keys(fields: dict[str, object], size: Size = None, what: object = "") -> 
         )
     corner = 0.5 * any(x.endswith("fl_x") for x in read)  # COLMAP's pixels begin there
     matrix = [*matrix[:2], *(x - corner for x in matrix[2:])]
-    flags = first(("fisheye_model", "is_fisheye")) == [1.0]
+    flags = first(_KEYS["fisheye"]) == [1.0]
     names += ["fisheye"] * (flags or any("fisheye" in x.rpartition(".")[0] for x in read))
     order = MODELS["fisheye" if lens(names, ())[0] == "fisheye" else "rational"].split()
     order = ["k2", "k3", "k4", "k5"] if any(x.endswith("mu") for x in read) else order
     single = [first([x]) for x in order]
-    distortion = first(_DISTORTION) or [x[0] if len(x) == 1 else 0.0 for x in single]
+    distortion = first(_KEYS["distortion"]) or [x[0] if len(x) == 1 else 0.0 for x in single]
     last = {x.rpartition(".")[2] for x in read}
     for key, value in told.items():
         name, found = key.rpartition(".")[2], numbers_of(value)
         if any(found) and name not in last and _BENDS.fullmatch(name):
             raise ValueError(f"its {key} is not read; name it distortion, in OpenCV's order")
     model, distortion = lens(names, distortion)
-    whole = first(_SIZE[0])[:2] or [x for names in _SIZE[1:] for x in first(names)[:1]]
+    whole = first(_KEYS["size"])[:2]
+    whole = whole or [*first(_KEYS["width"])[:1], *first(_KEYS["height"])[:1]]
     if len(whole) != 2 and size is not None:
         as_they_are = f"it is taken to be of the pictures as they are, {size[0]}x{size[1]}"
         warnings.warn(f"{what} states no image size: {as_they_are}", stacklevel=4)
@@ -194,7 +160,7 @@ def lens(names: Sequence[str], distortion: Sequence[float]) -> tuple[str, tuple[
     for name in (name.lower().removeprefix("distortion.").replace(" ", "_") for name in names):
         words += [name] if name in _MODELS else name.split("-")
     words = [x for x in words if x != "inverse_brown_conrady" or any(told)]  # RealSense's zeros
-    model = next(filter(None, map(_MODELS.get, words)), "")
+    model = next((x for x in map(_MODELS.get, words) if x != "pinhole"), "pinhole")
     most = 4 if model == "fisheye" else 8
     atan = model == "fisheye" and 0 < len(told) < 4  # SVO's, of one number
     if not set(words) <= _MODELS.keys() or any(told[most:]) or atan:
@@ -218,7 +184,7 @@ def _of_colmap(path: Path, lines: Sequence[str], size: Size) -> Calibration:
         told = f"{path} has {len(cameras)} cameras, of which the first"
         warnings.warn(f"{told} {'of this size ' * (fit != cameras)}is taken", stacklevel=4)
     name, *told = fit[0]
-    keys = f"width height {_COLMAP.get(name, '')}".split()
+    keys = ["width", "height", *_COLMAP.get(name, ())]
     if len(told) != len(keys) or name not in _COLMAP:
         known = ", ".join(_COLMAP)
         raise ValueError(f"unknown camera model {name} of {len(told)} numbers; known: {known}")

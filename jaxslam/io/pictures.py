@@ -15,9 +15,6 @@ _ORIENTATION = re.compile(
     rb"Exif\0\0.*?(?:\x12\x01\x03\0\x01\0\0\0(.)\0|\x01\x12\0\x03\0\0\0\x01\0(.))", re.DOTALL
 )
 """The entry of a JPEG's EXIF: its tag, its kind, one of it, and the orientation, in both orders."""
-Deep = Iterable[np.ndarray]
-"""Grey pictures of 8 bits or more."""
-
 _ACCEPTED = (
     "a picture is uint8, or floats from 0 to 1, of shape (height, width) or (height, width, 3)"
 )
@@ -48,18 +45,19 @@ def _in_bytes(array: np.ndarray) -> np.ndarray:
     return np.rint(255 * array).astype(np.uint8)
 
 
-def in_bytes(
-    name: str, pictures: Callable[[], Deep], some: Callable[[], Deep]
+def of_eight_bits(
+    name: str, pictures: Callable[[int], Iterable[np.ndarray]], count: int
 ) -> Callable[[], Iterator[UInt8[np.ndarray, "height width"]]]:
-    """Pictures with 8 bits: those that have no more as they are, of others the upper 8 bits.
+    """Grey pictures, so many, with 8 bits: as they are, or of 16 bits the upper 8.
 
-    Where `some` of the pictures use less than half of 16 bits, as those of a thermal camera do, all
-    are stretched by one gain about their means, which drift as the sensor warms, with a warning.
+    `pictures` gives every n-th of them. Where they use less than half of the levels of 16 bits, as
+    those of a thermal camera do, all are stretched by one gain about their means, which drift as
+    the sensor warms, with a warning.
     """
 
     @functools.cache
     def levels() -> tuple[float, float]:
-        about = [x.ravel()[::7] - x.mean() for x in some()]
+        about = [x.ravel()[::7] - x.mean() for x in pictures(count // 16 + 1)]
         low, high = np.percentile(np.concatenate(about), (0.5, 99.5)).tolist()
         if 0 < high - low < 2**15:
             told = f"more than 8 bits, of which {high - low:.0f} grey levels are used"
@@ -74,7 +72,7 @@ def in_bytes(
             return np.uint8(np.clip(picture / 256, 0, 255))
         return np.uint8(np.clip((picture - picture.mean() - low) * (255 / spread), 0, 255))
 
-    return lambda: map(of_bytes, pictures())
+    return lambda: map(of_bytes, pictures(1))
 
 
 def orientation(path: Path) -> int:

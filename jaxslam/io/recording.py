@@ -18,7 +18,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.io.imu import InertialFiles, inertial_files
 from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.logs.log import STEPS, UNITS, unit_of
-from jaxslam.io.pictures import in_bytes, orientation
+from jaxslam.io.pictures import of_eight_bits, orientation
 from jaxslam.io.source import Image, Trajectory
 from jaxslam.io.text import DATE, numbers, text_lines
 from jaxslam.io.tum import not_rigid, read_tum
@@ -74,14 +74,13 @@ def of_files(
         raise ValueError(f"{path}: there are {len(times)} times for {len(files)} pictures")
     if (own := path / "calibration.json").is_file():
         calibration = fixed(read_calibration(own))
-    name = path.resolve().name
-    inertial = inertial_files(path)
     how = functools.cache(lambda: _how_to_read(path, files))
 
-    def read(every: int = 1) -> Iterator[np.ndarray]:
+    def read(every: int) -> Iterator[np.ndarray]:
         return (read_image(file, how()) for file in files[::every])
 
-    images = in_bytes(name, read, lambda: read(len(files) // 16 + 1))
+    name, inertial = path.resolve().name, inertial_files(path)
+    images = of_eight_bits(name, read, len(files))
     return Recording(name, times, images, calibration, reference, inertial=inertial)
 
 
@@ -153,15 +152,13 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _numbers(files: Sequence[Path]) -> Float[np.ndarray, " n"] | None:
     """The numbers by which names differ: whole ones, decimal ones, or seconds and their part."""
-    stems = [file.stem for file in files]
-    shared = os.path.commonprefix(stems)  # noqa: RUF071 (of names, not of paths)
+    shared = os.path.commonprefix([x.stem for x in files])  # noqa: RUF071 (of names, not of paths)
     common = len(re.sub(r"(\d{9,}[._-]|\d+\.)?\d*$", "", shared))
-    found = [re.fullmatch(r"(\d{9,})[_-](\d+)(\D*)|([\d.]+)()(\D*)", x[common:]) for x in stems]
-    parts = [x.groups() for x in found if x is not None]
-    told = [".".join(filter(None, (x[0], x[1]))) or x[3] for x in parts]
-    alike = len(parts) == len(files) and len({x[2] or x[5] for x in parts}) == 1
-    numbered = numbers(told, len(files)) if alike else None
-    return None if numbered is None else np.array(numbered)
+    told = [re.sub(r"^(\d{9,})[_-](?=\d)", r"\1.", x.stem[common:]) for x in files]
+    found = [x for x in (re.fullmatch(r"([\d.]+)(\D*)", x) for x in told) if x is not None]
+    alike = len(found) == len(files) and len({x[2] for x in found}) == 1
+    read = numbers([x[1] for x in found], len(files)) if alike else None
+    return None if read is None else np.array(read)
 
 
 def _open_plain(path: Path, rate: float) -> Recording:

@@ -13,7 +13,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.io.imu import InertialFiles
 from jaxslam.io.lens_files import as_sent
 from jaxslam.io.lens_files import lens as lens_of
-from jaxslam.io.pictures import in_bytes
+from jaxslam.io.pictures import of_eight_bits
 from jaxslam.io.recording import Calibrator, Layout, Recording, check_increasing, decoded
 from jaxslam.io.ros import BAG, Message, Topic, bag_and_topic, chosen, messages, seconds
 
@@ -47,13 +47,13 @@ def _open(path: Path, _rate: float) -> Recording:
         warnings.warn(f"{topic}: {told}, and are left out", stacklevel=2)
     check_increasing(f"{topic}, message", np.flatnonzero(new).tolist(), stamps[new])
 
-    def images(every: int = 1) -> Iterator[np.ndarray]:
+    def images(every: int) -> Iterator[np.ndarray]:
         told = (x for x in enumerate(messages(topic)) if new[x[0]])
         part = itertools.islice(told, 0, None, every)
         return (as_image(f"{topic}, message {i}", x) for i, x in part)
 
     lens, inertial, name = _calibrator(topic), InertialFiles(bag), f"{topic}"
-    pictures = in_bytes(name, images, lambda: images(len(stamps) // 16 + 1))
+    pictures = of_eight_bits(name, images, len(stamps))
     return Recording(name, stamps[new], pictures, lens, inertial=inertial)
 
 
