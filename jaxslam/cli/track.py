@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -199,18 +199,14 @@ class TrackOptions:
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None
+        own = {x.name: getattr(self, x.name, x.default) for x in fields(TrackerSettings)}
         return TrackerSettings(
-            filter=METRIC if metric else self.filter,
-            landmarks=self.landmarks,
-            calibration=self.calibration_treatment,
-            nearest_depth=self.nearest_depth,
-            pixel_sigma=self.pixel_sigma,
-            readout=_seconds(self.readout),
-            acceleration_sigma=self.acceleration_sigma,
-            angular_acceleration_sigma=self.angular_acceleration_sigma,
-            association=self.association,
-            wanted=self.wanted,
-        )
+            **own | {
+                "filter": METRIC if metric else self.filter,
+                "calibration": self.calibration_treatment,
+                "readout": _seconds(self.readout),
+            }
+        )  # fmt: skip
 
 
 def _seconds(time: str) -> float:

@@ -163,33 +163,28 @@ def _numbers(files: Sequence[Path]) -> Float[np.ndarray, " n"] | None:
 
 def _open_plain(path: Path, rate: float) -> Recording:
     files = image_files(path)
-    times, told = _times_of_names(files, rate)
-    if told:
-        warnings.warn(f"{path}: {told}", stacklevel=2)
-    return of_files(path, files, times)
+    return of_files(path, files, _times_of_names(path, files, rate))
 
 
-def _times_of_names(files: Sequence[Path], rate: float) -> tuple[Float[np.ndarray, " n"], str]:
-    """The times of pictures by their names, and what there is to say about them.
-
-    Names are times since 1970 in s or a part of it, or numbers of pictures at this rate, some of
-    which may be missing.
-    """
-    told, even = _numbers(files), np.arange(len(files)) / rate
-    if told is not None and len(files) > 1:
-        steps = np.diff(told)
-        each = np.median(steps)
-        unit = _since_1970(told)
-        if unit and (steps > 0).all() and STEPS[0] <= each * unit <= STEPS[1]:
-            return told * unit, "the names of the pictures are taken as their times"
-        counted = each > 0 and not (steps % each).any() and not (told % 1).any()
-        if not unit and counted and each < steps.max() <= 10 * each:
-            missing = (steps / each - 1).sum()
-            why = f"{missing:.0f} pictures are missing by the numbers of the others"
-            return (told - told[0]) / each / rate, f"{why}, which keep their times"
+def _times_of_names(path: Path, files: Sequence[Path], rate: float) -> Float[np.ndarray, " n"]:
+    """The times of pictures by their names, with a warning: since 1970 in s or a part of it, or at
+    this rate by their numbers, some of which may be missing."""
+    times, told, words = np.arange(len(files)) / rate, _numbers(files), ""
     if files and re.search(r"\d{9}|\d{8}[_-]\d{6}", files[0].stem):
-        return even, f"names are not read as times; --rate ({rate:g} pictures per second) is taken"
-    return even, ""
+        words = f"names are not read as times; --rate ({rate:g} pictures per second) is taken"
+    if told is not None and len(files) > 1:
+        steps, unit = np.diff(told), _since_1970(told)
+        each = np.median(steps)
+        counted = each > 0 and not (steps % each).any() and not (told % 1).any()
+        if unit and (steps > 0).all() and STEPS[0] <= each * unit <= STEPS[1]:
+            times, words = told * unit, "the names of the pictures are taken as their times"
+        elif not unit and counted and each < steps.max() <= 10 * each:
+            times, missing = (told - told[0]) / each / rate, (steps / each - 1).sum()
+            words = f"{missing:.0f} pictures are missing by the numbers of the others, which keep "
+            words += "their times"
+    if words:
+        warnings.warn(f"{path}: {words}", stacklevel=2)
+    return times
 
 
 def _since_1970(times: Float[np.ndarray, " n"]) -> float:
