@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 
@@ -17,6 +18,12 @@ def exported(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], A
         return getattr(import_module(f"{room}.{module_of[name]}"), name)
 
     return attribute
+
+
+def imported(room: Mapping[str, object]) -> list[str]:
+    """The `__all__` of a room that exports what it imports, and its tables: its public names."""
+    ours = {x for x, value in room.items() if not x.startswith("_") and value is not imported}
+    return sorted(x for x in ours if not isinstance(room[x], ModuleType))
 
 
 def plotted(name: str) -> Callable[..., Any]:

@@ -6,7 +6,7 @@ import re
 import warnings
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -199,7 +199,7 @@ class TrackOptions:
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None
-        own = {x.name: getattr(self, x.name, x.default) for x in fields(TrackerSettings)}
+        own: Any = {x.name: getattr(self, x.name, x.default) for x in fields(TrackerSettings)}
         return TrackerSettings(
             **own | {
                 "filter": METRIC if metric else self.filter,

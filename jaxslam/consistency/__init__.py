@@ -1,5 +1,6 @@
 """The consistency of filters: Monte Carlo runs, NEES and NIS with exact bounds, their summary."""
 
+from jaxslam._runtime import imported
 from jaxslam.consistency.backends import BACKENDS
 from jaxslam.consistency.likelihood import log_likelihood
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
@@ -16,10 +17,4 @@ from jaxslam.consistency.suite import read_suite, write_suite
 from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
 from jaxslam.consistency.tuning import LogFit, Tuning, TuningSettings, fit_of, tune
 
-__all__ = [
-    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "LogFit", "MemoryStore",
-    "Results", "Seconds", "SimulatedFrame", "Study", "Summary", "Tuning", "TuningSettings",
-    "check_sizes", "draw", "filter_run", "fit_of", "log_likelihood", "monte_carlo",
-    "of_simulation", "read_suite", "run_through", "scale_records", "summarise", "table", "tally",
-    "treatment", "tune", "write_suite",
-]  # fmt: skip
+__all__ = imported(globals())

@@ -1,5 +1,6 @@
 """The evaluation of any filter: from errors and covariances, in arrays or files, to a verdict."""
 
+from jaxslam._runtime import imported
 from jaxslam.evaluation.convention import (
     CHOICES,
     Convention,
@@ -15,20 +16,4 @@ from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
 from jaxslam.evaluation.scale import errors_beyond_scale
 
-__all__ = [
-    "CHOICES",
-    "Convention",
-    "Evaluation",
-    "Identification",
-    "advice",
-    "converted",
-    "errors_beyond_scale",
-    "evaluate",
-    "evaluate_log",
-    "evaluate_nees",
-    "evaluate_poses",
-    "pose_errors",
-    "read_covariances",
-    "read_pose_log",
-    "write_covariances",
-]
+__all__ = imported(globals())

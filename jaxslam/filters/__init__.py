@@ -1,5 +1,6 @@
 """Filters, and what they are made of: the record and its pieces, for filters of your own."""
 
+from jaxslam._runtime import imported
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman, kalman_update
 from jaxslam.filters.mixture.mixture import Mixture
@@ -15,35 +16,4 @@ from jaxslam.filters.submaps.closing import Loops, Posterior, agreeing, close, p
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter, make_filters, scenario_pieces
 
-__all__ = [
-    "FILTERS",
-    "MODIFIERS",
-    "AbstractCorrection",
-    "AbstractFilter",
-    "AbstractStaged",
-    "Chain",
-    "FirstEstimates",
-    "FromWindow",
-    "Gate",
-    "Invariant",
-    "Kalman",
-    "Loops",
-    "Mixture",
-    "ObservabilityConstrained",
-    "Posterior",
-    "RandomWalk",
-    "Schedule",
-    "Slam",
-    "agreeing",
-    "base_poses",
-    "chain",
-    "close",
-    "compatible",
-    "kalman_update",
-    "make_filter",
-    "make_filters",
-    "paper",
-    "posterior",
-    "recommended",
-    "scenario_pieces",
-]
+__all__ = imported(globals())

@@ -5,9 +5,10 @@ import json
 import re
 import tomllib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -212,7 +213,7 @@ def _tree(element: ElementTree.Element) -> dict[str, object]:
     return {x.tag: _tree(x) if len(x) else x.text for x in element}
 
 
-def _flat(fields: dict[object, object], before: str = "") -> dict[str, object]:
+def _flat(fields: Mapping[Any, object], before: str = "") -> dict[str, object]:
     """Nested keys joined by dots; of a list of objects the first one's."""
     result: dict[str, object] = {}
     for key, value in fields.items():

@@ -68,9 +68,9 @@ def of_eight_bits(
         if picture.dtype == np.uint8:
             return picture
         low, spread = levels()
-        if not 0 < spread < 2**15:
-            return np.uint8(np.clip(picture / 256, 0, 255))
-        return np.uint8(np.clip((picture - picture.mean() - low) * (255 / spread), 0, 255))
+        if 0 < spread < 2**15:
+            picture = (picture - picture.mean() - low) * (255 * 256 / spread)
+        return np.clip(picture / 256, 0, 255).astype(np.uint8)
 
     return lambda: map(of_bytes, pictures(1))
 

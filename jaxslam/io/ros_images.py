@@ -62,7 +62,8 @@ def as_image(place: str, message: Message) -> np.ndarray:
     if not hasattr(message, "encoding"):
         image = decoded(place, message.data, _FLAGS)
         mosaic = re.match(r"(bayer_\w{4})\d+;(?!.*(bgr|rgb)8$)", message.format)
-        return image if mosaic is None else cv2.cvtColor(image, _GREY[mosaic[1]][1])
+        how = None if mosaic is None else _GREY[mosaic[1]][1]
+        return image if how is None else cv2.cvtColor(image, how)
     encoding = _SAME.get(message.encoding, message.encoding)
     name, size = encoding.removesuffix("8").removesuffix("16"), 2 if encoding.endswith("16") else 1
     if name not in _GREY or name == encoding:

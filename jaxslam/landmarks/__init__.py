@@ -1,5 +1,6 @@
 """Landmark parametrizations: one file each, and the table of their names."""
 
+from jaxslam._runtime import imported
 from jaxslam.landmarks.anchored_homogeneous import AnchoredHomogeneous
 from jaxslam.landmarks.cartesian import Cartesian
 from jaxslam.landmarks.check import check_landmark
@@ -28,17 +29,4 @@ LANDMARKS: dict[str, AbstractLandmark] = {
 }
 """Every parametrization by its name."""
 
-__all__ = [
-    "LANDMARKS",
-    "AbstractLandmark",
-    "AnchoredHomogeneous",
-    "Cartesian",
-    "FramedHomogeneous",
-    "ImagePlane",
-    "InverseDepthToCartesian",
-    "InverseScaling",
-    "ParallaxAngle",
-    "UnifiedInverseDepth",
-    "UnitHomogeneous",
-    "check_landmark",
-]
+__all__ = imported(globals())

@@ -1,5 +1,6 @@
 """Simulation: worlds of pieces, scenarios by name, and runs drawn from them."""
 
+from jaxslam._runtime import imported
 from jaxslam.simulation.draw import as_data, simulate, trajectory_of, with_own
 from jaxslam.simulation.placement import Cloister, FromPrior, GivenPoints, Rays, Ring
 from jaxslam.simulation.run import Room, Run, features, gone, sightings
@@ -19,10 +20,4 @@ from jaxslam.simulation.world import (
 Scenario = World
 """The name of a world in versions before 0.6."""
 
-__all__ = [
-    "BUILT_IN", "AbstractPlacement", "AbstractTrueCalibration", "Cloister",
-    "ConstantCalibration", "Drift", "FromPrior", "GivenPoints", "Limits", "NominalCalibration",
-    "Rays", "RecordedMotion", "Ring", "Room", "Run", "Scenario", "WhiteCalibration", "World",
-    "as_data", "as_scenario", "features", "gone", "scenario", "sightings", "simulate",
-    "trajectory_of", "with_own",
-]  # fmt: skip
+__all__ = imported(globals())

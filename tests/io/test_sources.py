@@ -269,6 +269,8 @@ def test_the_folder_of_a_camera_is_opened_and_one_above_pictures_names_it(tmp_pa
     whole, camera = open_source(path), open_source(path / "mav0" / "cam0")
     assert camera.calibration == whole.calibration
     np.testing.assert_array_equal(camera.times, whole.times)
+    assert camera.reference is not None
+    assert whole.reference is not None
     np.testing.assert_array_equal(camera.reference.T_wc, whole.reference.T_wc)
     write_pictures(tmp_path / "P001" / "image_left", ["0.png"])
     with pytest.raises(ValueError, match=r"\(pictures are in image_left: give one of these\), not"):
