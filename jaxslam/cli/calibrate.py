@@ -14,7 +14,7 @@ from jaxslam.cli.extra import one_line_warnings, require_vision
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Options of the command; every field is an option."""
+    """Calibrate a camera, with uncertainty, from a video of a board."""
 
     board_video: Annotated[
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="BOARD_VIDEO")

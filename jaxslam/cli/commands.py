@@ -12,25 +12,18 @@ from jaxslam.cli.evaluate import EvaluateOptions
 from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
-_COMMANDS = {
-    "consistency": (ConsistencyOptions, "Simulate many runs of filters: are they consistent?"),
-    "evaluate": (EvaluateOptions, "Test the consistency of your own filter from its errors."),
-    "track": (TrackOptions, "Track a camera through a video: trajectory, map, overlay."),
-    "calibrate": (
-        CalibrateOptions,
-        "Calibrate a camera, with uncertainty, from a video of a board.",
-    ),
-    "triangulate": (
-        TriangulateOptions,
-        "How well do two views determine a depth, and is the estimate consistent?",
-    ),
-}
-Command: Any = Union[  # noqa: UP007 (of a table)
-    tuple(
-        Annotated[options, tyro.conf.subcommand(name, description=told)]
-        for name, (options, told) in _COMMANDS.items()
-    )
-]
+_COMMANDS = (
+    ConsistencyOptions, EvaluateOptions, TrackOptions, CalibrateOptions, TriangulateOptions,
+)  # fmt: skip
+"""Every field of one is an option, and its docstring what the command does."""
+
+
+def _command(options: type) -> Any:
+    name = options.__name__.removesuffix("Options").lower()
+    return Annotated[options, tyro.conf.subcommand(name, description=options.__doc__)]
+
+
+Command: Any = Union[tuple(map(_command, _COMMANDS))]  # noqa: UP007 (of a table)
 
 
 def parse(arguments: list[str]) -> Any:

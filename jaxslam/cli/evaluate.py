@@ -27,7 +27,7 @@ _OF_ONE_LOG = (
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Options of the command; every field is an option."""
+    """Test the consistency of your own filter from its errors."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz (or .mat) with errors and

@@ -19,7 +19,7 @@ from jaxslam.tracking.settings import METRIC, TrackerSettings
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of the command; every field is an option."""
+    """Track a camera through a video: trajectory, map, overlay."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes),

@@ -59,7 +59,9 @@ def _of_text(path: Path, lines: list[str], size: Size) -> Calibration:
         return _of_colmap(path, lines, size)
     if text.startswith("{") or (text.startswith("[") and text.endswith("]")):
         fields = json.loads(text)
-        if not isinstance(fields, dict) or _is_own(fields):
+        foreign = {x for x in fields if _BENDS.fullmatch(str(x).lower())} - {"distortion"}
+        own = "model" in fields or {"fx", "distortion"} <= {*fields}
+        if not isinstance(fields, dict) or (own and not foreign):
             return from_fields(fields)
         fields = _flat(fields)
     elif text.startswith("<"):
@@ -68,13 +70,6 @@ def _of_text(path: Path, lines: list[str], size: Size) -> Calibration:
         matrix = numbers_of(text)
         fields = {"K": matrix} if matrix else yaml_keys(path.read_text(encoding="utf-8-sig"))
     return of_keys(fields, size, path)
-
-
-def _is_own(fields: dict[str, object]) -> bool:
-    """Whether the keys are those of `write_calibration`, and no others of what bends pictures."""
-    named = "sigma" in fields or "distortion" in fields or fields.get("model") in MODELS
-    others = [key for key in fields if _BENDS.fullmatch(key.lower()) and key != "distortion"]
-    return named and not others and ("fx" in fields or "model" in fields)
 
 
 def of_keys(fields: dict[str, object], size: Size = None, what: object = "") -> Calibration:
