@@ -148,15 +148,11 @@ class TrackOptions:
         from jaxslam.tracking.synthetic import synthetic_source
 
         if self.source is not None:
+            names = ("calibration", "fov", "reference", "rate", "start", "every", "frames")
+            how: Any = {name: getattr(self, name) for name in names}
             return open_source(
                 self.source if self.topic is None else f"{self.source}:{self.topic}",
-                calibration=self.calibration,
-                fov=self.fov,
-                reference=self.reference,
-                rate=self.rate,
-                start=self.start,
-                every=self.every,
-                frames=self.frames,
+                **how,
                 # A target's pixels are those of the pictures as they are.
                 scale=1.0 if self.scale is None and self.target else self.scale,
             )

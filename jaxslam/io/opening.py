@@ -5,6 +5,7 @@ import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from jaxslam.io.calibration import (
     GUESSED_FIELD_OF_VIEW,
@@ -61,10 +62,8 @@ def open_source(
     height, width = image.shape
     camera = _calibration(recording, width, height, calibration, fov)
     check_size(f"{recording.name}: image 0", image, camera)
-    source = Source(
-        recording.name, camera, recording.times, recording.images, recording.reference,
-        recording.clock, inertial=recording.inertial,
-    )  # fmt: skip
+    held: Any = vars(recording) | {"calibration": camera}
+    source = Source(**held)
     if reference is not None:
         source = replace(source, reference=Trajectory(*read_tum(reference)))
     if scale is None:
@@ -110,9 +109,7 @@ def _scale_for(name: str, width: int, height: int) -> float:
 
 def _of_pictures(name: str, camera: Calibration, width: int, height: int) -> Calibration:
     """A calibration at the size of the pictures, where theirs is the same shape."""
-    if (camera.width, camera.height) == (width, height) or (
-        camera.width * height != camera.height * width
-    ):
+    if camera.width == width or camera.width * height != camera.height * width:
         return camera
     warnings.warn(
         f"{name} is for {camera.width}x{camera.height}: it is taken to be of the same pictures "
