@@ -15,15 +15,16 @@ from jaxslam.cli.triangulate import TriangulateOptions
 _COMMANDS = (
     ConsistencyOptions, EvaluateOptions, TrackOptions, CalibrateOptions, TriangulateOptions,
 )  # fmt: skip
-"""Every field of one is an option, and its docstring what the command does."""
+"""A command is called by its class without `Options`; every field is an option of it, and its
+docstring says what it does."""
 
 
-def _command(options: type) -> Any:
-    name = options.__name__.removesuffix("Options").lower()
-    return Annotated[options, tyro.conf.subcommand(name, description=options.__doc__)]
-
-
-Command: Any = Union[tuple(map(_command, _COMMANDS))]  # noqa: UP007 (of a table)
+Command: Any = Union[  # noqa: UP007 (of a table)
+    tuple(
+        Annotated[x, tyro.conf.subcommand(x.__name__[:-7].lower(), description=x.__doc__)]
+        for x in _COMMANDS
+    )
+]
 
 
 def parse(arguments: list[str]) -> Any:
