@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.cli.extra import one_line_warnings, require_vision
+from jaxslam.cli.extra import one_line_warnings, require_vision, seconds
 from jaxslam.filters.association import ASSOCIATIONS
 from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
@@ -200,14 +199,6 @@ class TrackOptions:
             **own | {
                 "filter": METRIC if metric else self.filter,
                 "calibration": self.calibration_treatment,
-                "readout": _seconds(self.readout),
+                "readout": seconds("--readout", self.readout),
             }
         )  # fmt: skip
-
-
-def _seconds(time: str) -> float:
-    """The seconds of a time with a unit. Raises ValueError."""
-    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*(s|ms|us|µs|)\s*", time)
-    if found is None:
-        raise ValueError(f"--readout is a time such as 20ms or 0.02s, not {time!r}")
-    return float(found[1]) * {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}[found[2]]

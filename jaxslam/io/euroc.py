@@ -26,8 +26,7 @@ KEY = "T_BS.data"
 
 
 def _open(path: Path, _rate: float) -> Recording:
-    camera = _camera(path)
-    assert camera is not None
+    camera = _camera(path) or path
     root, listing = camera.parent, camera / "data.csv"
     times, names = read_timestamps(listing)
     files = listed(listing, camera / "data", names)

@@ -103,14 +103,14 @@ def of_listing(
     times, names = read_timestamps(listing)
     truth = path / "groundtruth.txt"
     reference = Trajectory(*read_tum(truth)) if truth.is_file() else None
-    files = listed(listing, folder, names) if names else image_files(folder)
-    return of_files(path, files, times, calibration, reference)
+    return of_files(path, listed(listing, folder, names), times, calibration, reference)
 
 
 def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
-    """Files in a folder whose names a list holds. Raises ValueError for one that is missing."""
-    files = [folder / name for name in names]
-    for name, file in zip(names, files, strict=True):
+    """Files in a folder whose names a list holds, or all. Raises ValueError for one that is
+    missing."""
+    files = [folder / name for name in names] or image_files(folder)
+    for name, file in zip(names, files, strict=False):
         if not os.path.isfile(file):  # which a name that no file can have is not either
             raise ValueError(f"{listing} names {name}, but {file} is missing")
     return files
@@ -180,8 +180,7 @@ def _times_of_names(path: Path, files: Sequence[Path], rate: float) -> Float[np.
             times, words = told * unit, "the names of the pictures are taken as their times"
         elif not unit and counted and each < steps.max() <= 10 * each:
             times, missing = (told - told[0]) / each / rate, (steps / each - 1).sum()
-            words = f"{missing:.0f} pictures are missing by the numbers of the others, which keep "
-            words += "their times"
+            words = f"{missing:.0f} pictures are missing by their numbers, and their time is kept"
     if words:
         warnings.warn(f"{path}: {words}", stacklevel=2)
     return times

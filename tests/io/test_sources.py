@@ -215,7 +215,7 @@ TAKEN = "the names of the pictures are taken as their times"
         (
             [f"cam0_{x}" for x in (1, 2, 9, 10)],
             [0.0, 0.1, 0.8, 0.9],
-            "6 pictures are missing by the numbers of the others, which keep their times",
+            "6 pictures are missing by their numbers, and their time is kept",
         ),
         ([f"{x:06d}.color" for x in (0, 5, 10, 15)], [0.0, 0.1, 0.2, 0.3], ""),
         (["0.1", "0.13", "0.2", "0.25"], [0.0, 0.1, 0.2, 0.3], ""),
