@@ -5,10 +5,9 @@ import json
 import re
 import tomllib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -208,13 +207,10 @@ def _tree(element: ElementTree.Element) -> dict[str, object]:
     return {x.tag: _tree(x) if len(x) else x.text for x in element}
 
 
-def _flat(fields: Mapping[Any, object], before: str = "") -> dict[str, object]:
+def _flat(value: object, name: str = "") -> dict[str, object]:
     """Nested keys joined by dots; of a list of objects the first one's."""
-    result: dict[str, object] = {}
-    for key, value in fields.items():
-        own = value[0] if isinstance(value, list) and value else value
-        if isinstance(own, dict):
-            result |= _flat(own, f"{before}{key}.")
-        else:
-            result[f"{before}{key}"] = value
-    return result
+    own = value[0] if isinstance(value, list) and value else value
+    if not isinstance(own, dict):
+        return {name: value}
+    parts = (_flat(x, f"{name}.{key}" if name else str(key)) for key, x in own.items())
+    return {key: x for part in parts for key, x in part.items()}
