@@ -7,6 +7,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from jaxslam._version import __version__ as __version__
+
 
 def exported(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a room, given the names that it has of each module in it."""

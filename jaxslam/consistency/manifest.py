@@ -29,7 +29,7 @@ LAYOUT = 8
 
 def versions() -> dict[str, str]:
     """The versions of the packages that decide the digits of a result."""
-    from jaxslam._version import __version__
+    from jaxslam._runtime import __version__
 
     return {"jaxslam": __version__, **{name: version(name) for name in ("jax", "jaxlib")}}
 

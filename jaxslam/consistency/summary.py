@@ -107,7 +107,7 @@ class Study(Mapping):
     @property
     def results(self) -> Results:
         """The results of all filters, which need no records any more."""
-        from jaxslam._version import __version__
+        from jaxslam._runtime import __version__
 
         steps = self.scenario.steps
         return Results(

@@ -347,7 +347,7 @@ def _told(evaluation: Evaluation) -> str:
 
 
 def _as_json(evaluation: Evaluation) -> dict[str, Json]:
-    from jaxslam._version import __version__
+    from jaxslam._runtime import __version__
 
     names, bias, found = [*enumerate(evaluation.names)], evaluation.bias, evaluation.correlation
     outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma

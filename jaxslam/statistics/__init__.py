@@ -1,5 +1,6 @@
 """Exact statistics of errors and their covariances: NEES and NIS, χ² bands, verdicts."""
 
+from jaxslam._runtime import imported
 from jaxslam.statistics.bands import (
     PowerSums,
     chi2_quantile,
@@ -18,18 +19,4 @@ from jaxslam.statistics.verdict import (
     sentences,
 )
 
-__all__ = [
-    "PowerSums",
-    "Tally",
-    "Verdict",
-    "chi2_quantile",
-    "innovation_verdict",
-    "lost_runs",
-    "lost_threshold",
-    "mean_band",
-    "normalised_squared",
-    "not_disproved",
-    "one_scale",
-    "run_verdict",
-    "sentences",
-]
+__all__ = imported(globals())
