@@ -267,7 +267,8 @@ class Estimator:
         return mean, np.sqrt(np.diagonal(covariance))
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
-        """Start two threads that compile all programs in the order in which they are needed."""
+        """Start threads that compile all programs: the longest first, beside those that are needed
+        first."""
         slam, state, still = self.slam, self.empty(), np.zeros(())
         if self.inertial is not None:
             still = self.inertial.imu.still(jnp.float64)
@@ -291,19 +292,18 @@ class Estimator:
             lambda: _at_rest.compile(slam, state),
         )
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
-        return [
-            in_background(
-                lambda: _renew_map.compile(slam, state, new), lambda: self.camera(state), *graph
-            ),
-            in_background(
-                lambda: _begin_map.compile(slam, state, new, None),
-                lambda: _correct.compile(slam, predicted().state, still, none),
-                *(partial(believed, one) for one in (*wide, None)),
-                lambda: _world_points.compile(slam, state, self.settings.capacity),
-                lambda: _remove.compile(slam, state, gone),
-                *(back if self.inertial is None else ()),
-            ),
-        ]
+        return in_background(
+            lambda: _renew_map.compile(slam, state, new),
+            lambda: _begin_map.compile(slam, state, new, None),
+            lambda: _correct.compile(slam, predicted().state, still, none),
+            *(partial(believed, one) for one in (None, *wide)),
+            lambda: _world_points.compile(slam, state, self.settings.capacity),
+            lambda: _remove.compile(slam, state, gone),
+            *(back if self.inertial is None else ()),
+            lambda: self.camera(state),
+            *graph,
+            threads=2,
+        )
 
     def _of_fixed_size(self, found: Candidates, *, several: bool) -> Candidates:
         """Return as many as there can be, by their landmarks: those added are not valid."""
@@ -365,7 +365,7 @@ def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
     return replace(features, noise_factor=more)
 
 
-@Program
+@partial(Program, options=QUICK)
 def _empty(slam: AbstractStaged, capacity: int, before: Belief | None) -> Belief:
     return _going_on(slam, before).init(capacity)
 
@@ -458,7 +458,7 @@ def _correct(
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
-@Program
+@partial(Program, options=QUICK)
 def _begin_map(
     slam: AbstractStaged, state: Belief, new: Features, depths: tuple[jax.Array, jax.Array] | None
 ) -> tuple[Belief, Report]:
