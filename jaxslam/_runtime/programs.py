@@ -272,20 +272,23 @@ def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.C
     return lowered.compile()
 
 
-def in_background(*steps: Callable[[], object]) -> threading.Thread:
-    """Take the steps one after the other, aside; those not started when the process ends are left
-    out. What goes wrong will do so again where it is needed."""
+def in_background(*steps: Callable[[], object], threads: int = 1) -> list[threading.Thread]:
+    """Take the steps aside, in their order, each by the first thread that is free; those not
+    started when the process ends are left out. What goes wrong will do so again where it is
+    needed."""
+    left, of_64_bits = iter(steps), wide()
 
-    @jax.enable_x64(wide())
     def take() -> None:
-        for step in steps:
-            if threading.main_thread().is_alive():
-                with contextlib.suppress(Exception):
-                    step()
+        with jax.enable_x64(of_64_bits):
+            for step in left:
+                if threading.main_thread().is_alive():
+                    with contextlib.suppress(Exception):
+                        step()
 
-    thread = threading.Thread(target=take)
-    thread.start()
-    return thread
+    taking = [threading.Thread(target=take) for _ in range(threads)]
+    for thread in taking:
+        thread.start()
+    return taking
 
 
 class _Pickled(NamedTuple):

@@ -15,11 +15,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.linalg.lapack import dtrtri  # ty: ignore[missing-module-member]
 
 from jaxslam._numerics.arrays import cast
-from jaxslam._runtime.programs import Program, in_background
+from jaxslam._runtime.programs import QUICK, Program, in_background
 from jaxslam.filters.association import (
     ASSOCIATIONS,
     Association,
@@ -173,19 +171,18 @@ class Estimator:
     def nis(self, predicted: Predicted, seen: Observations) -> tuple[float, int]:
         """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
         S, residual = self._innovations(predicted, seen)
-        return float(residual @ _solve(S, residual)), len(residual)
+        return float(residual @ np.linalg.solve(S, residual)), len(residual)
 
     def each_given_others(self, predicted: Predicted, seen: Observations) -> Pixels:
         """Return the innovation of each that was seen given those of all others, whitened:
         `L⁻¹ (S⁻¹ r)_i` with `L Lᵀ = (S⁻¹)_ii`, of unit covariance."""
         S, residual = self._innovations(predicted, seen)
         try:
-            root, _ = cho_factor(S, lower=True, check_finite=False)
-        except LinAlgError:  # nothing can be said
+            root = np.linalg.inv(np.linalg.cholesky(S))
+        except np.linalg.LinAlgError:  # nothing can be said
             return np.zeros((len(seen.slots), 2))
-        of_each = cho_solve((root, True), residual, check_finite=False).reshape(-1, 2, 1)
-        # A solver for many right sides takes threads, as in `_solve`.
-        whitening = np.tril(dtrtri(root, lower=1)[0]).reshape(len(S), -1, 2)
+        of_each = (root.T @ (root @ residual)).reshape(-1, 2, 1)
+        whitening = root.reshape(len(S), -1, 2)
         blocks = np.einsum("nki,nkj->kij", whitening, whitening)
         return np.linalg.solve(np.linalg.cholesky(blocks), of_each)[..., 0]
 
@@ -196,7 +193,7 @@ class Estimator:
         S = predicted.joint.reshape(n * p, n * p)
         known = (p * seen.slots[:, None] + np.arange(p)).ravel()
         of_known, residual = self._innovations(predicted, seen)
-        gain = _solve(of_known, S[known]).T
+        gain = np.linalg.solve(of_known, S[known]).T
         # The noise of a pixel that is known is no part of what else is to be expected there.
         moved = (gain @ residual).reshape(n, p)
         left = np.einsum("npk,nqk->npq", gain.reshape(n, p, -1), S[:, known].reshape(n, p, -1))
@@ -267,7 +264,8 @@ class Estimator:
         return mean, np.sqrt(np.diagonal(covariance))
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
-        """Start two threads that compile all programs in the order in which they are needed."""
+        """Start threads that compile all programs: the longest first, beside those that are needed
+        first."""
         slam, state, still = self.slam, self.empty(), np.zeros(())
         if self.inertial is not None:
             still = self.inertial.imu.still(jnp.float64)
@@ -291,19 +289,18 @@ class Estimator:
             lambda: _at_rest.compile(slam, state),
         )
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
-        return [
-            in_background(
-                lambda: _renew_map.compile(slam, state, new), lambda: self.camera(state), *graph
-            ),
-            in_background(
-                lambda: _begin_map.compile(slam, state, new, None),
-                lambda: _correct.compile(slam, predicted().state, still, none),
-                *(partial(believed, one) for one in (*wide, None)),
-                lambda: _world_points.compile(slam, state, self.settings.capacity),
-                lambda: _remove.compile(slam, state, gone),
-                *(back if self.inertial is None else ()),
-            ),
-        ]
+        return in_background(
+            lambda: _renew_map.compile(slam, state, new),
+            lambda: _begin_map.compile(slam, state, new, None),
+            lambda: _correct.compile(slam, predicted().state, still, none),
+            *(partial(believed, one) for one in (None, *wide)),
+            lambda: _world_points.compile(slam, state, self.settings.capacity),
+            lambda: _remove.compile(slam, state, gone),
+            *(back if self.inertial is None else ()),
+            lambda: self.camera(state),
+            *graph,
+            threads=2,
+        )
 
     def _of_fixed_size(self, found: Candidates, *, several: bool) -> Candidates:
         """Return as many as there can be, by their landmarks: those added are not valid."""
@@ -342,15 +339,6 @@ def _check_finite(*arrays: np.ndarray) -> None:
         raise FloatingPointError("the camera's pose is not finite")
 
 
-def _solve(S: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m ..."]) -> np.ndarray:
-    """S⁻¹ b of a covariance. LAPACK's general solver takes threads from a hundred rows on, and on a
-    busy machine those wait for one another: 50 ms in place of .1."""
-    try:
-        return cho_solve(cho_factor(S, lower=True, check_finite=False), b, check_finite=False)
-    except LinAlgError:
-        return np.linalg.solve(S, b)
-
-
 def _padded(slots: Slots, pixels: Pixels, size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
@@ -365,7 +353,7 @@ def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
     return replace(features, noise_factor=more)
 
 
-@Program
+@partial(Program, options=QUICK)
 def _empty(slam: AbstractStaged, capacity: int, before: Belief | None) -> Belief:
     return _going_on(slam, before).init(capacity)
 
@@ -458,7 +446,7 @@ def _correct(
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
-@Program
+@partial(Program, options=QUICK)
 def _begin_map(
     slam: AbstractStaged, state: Belief, new: Features, depths: tuple[jax.Array, jax.Array] | None
 ) -> tuple[Belief, Report]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam._runtime.files import Json
+from jaxslam._runtime.threads import in_one_thread
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.optics import sighted
@@ -49,6 +50,7 @@ class BetterLens(NamedTuple):
         }
 
 
+@in_one_thread
 def better_lens(history: History, points: Points, calibration: Calibration) -> BetterLens:
     """Adjust views of three stretches of the video with the points that they share, from where the
     tracker has both, with the lens that was given and with focal length and k1 free."""

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from scipy.linalg import LinAlgError
 
+from jaxslam._runtime.threads import in_one_thread
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.pictures import as_grey
@@ -62,6 +63,7 @@ def start(
         return TrackerState(estimator, calibration, Map(estimator.empty()))
 
 
+@in_one_thread
 def step(
     slam: AbstractStaged,
     settings: TrackerSettings,

@@ -99,7 +99,8 @@ def test_steps_are_taken_aside_in_the_callers_precision():
 
     program, caller = Program(scaled), wide()
     with jax.enable_x64(not caller):
-        in_background(failing, lambda: program.compile(*arguments())).join()
+        (thread,) = in_background(failing, lambda: program.compile(*arguments()))
+        thread.join()
         assert traced == [not caller]
         check(program)
     assert traced == [not caller]

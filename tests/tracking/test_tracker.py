@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_info, threadpool_limits
 
 pytest.importorskip("cv2")
 
@@ -55,6 +56,24 @@ def tracked(tmp_path_factory):
     out = tmp_path_factory.mktemp("tracked")
     source = small(FRAMES)
     return out, source, track(source, out, SMALL)
+
+
+def test_a_frame_takes_one_thread_of_blas(monkeypatch):
+    """Else they wait for one another, for longer than they compute."""
+
+    def threads():
+        return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+    def taken(*data):
+        found.append(threads())
+        return really(*data)
+
+    found, really, source = [], trackers._taken, small(1)
+    monkeypatch.setattr(trackers, "_taken", taken)
+    with threadpool_limits(2, user_api="blas"):
+        Tracker(source.calibration, SMALL).track(next(iter(source)))
+        assert threads() == {2}
+    assert found == [{1}]
 
 
 def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
