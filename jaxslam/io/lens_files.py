@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
 from jaxslam.io.calibration import INTRINSICS, MODELS, Calibration, from_fields
 from jaxslam.io.text import numbers_of, text_lines
@@ -189,8 +190,10 @@ def _of_colmap(path: Path, lines: Sequence[str], size: Size) -> Calibration:
 def yaml_keys(text: str) -> dict[str, object]:
     """The keys of YAML, of nested ones joined by dots, and their numbers, lists or words; of the
     first of several cameras or IMUs. Raises ValueError for what is no YAML."""
-    import yaml
-
+    try:
+        import yaml
+    except ImportError as error:
+        raise missing("YAML needs", "vision", error) from None
     # OpenCV's directive and types are its own.
     told = re.sub(r"^%.*|!!\S+", "", text, flags=re.MULTILINE).expandtabs()
     try:
