@@ -28,7 +28,7 @@ class TrackOptions:
     calibration: Path | None = None
     """Camera calibration, a JSON file with model (pinhole, rational or fisheye), width, height, fx,
     fy, cx, cy and distortion (in OpenCV's order), or a file of OpenCV, ROS, Kalibr, EuRoC, TUM-VI,
-    ORB-SLAM or COLMAP."""
+    ORB-SLAM, COLMAP or another program (docs/own-video.md)."""
     fov: float | None = None
     """Horizontal field of view in degrees, in place of a calibration; focal length, centre and
     distortion (k1, k2) of the lens are then estimated.

@@ -45,7 +45,7 @@ def _camera(path: Path) -> Path | None:
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
-    T_BS = pose_of_keys(yaml, yaml_keys(yaml.read_text(encoding="utf-8-sig")), {KEY: False})
+    T_BS = pose_of_keys(yaml, yaml_keys(yaml), {KEY: False})
     if T_BS is None:
         raise ValueError(f"{yaml}: {KEY}: [16 finite numbers] is missing")
     columns = "eight finite numbers ns px py pz qw qx qy qz"

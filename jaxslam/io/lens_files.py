@@ -68,7 +68,7 @@ def _of_text(path: Path, lines: list[str], size: Size) -> Calibration:
         fields = _flat(_tree(ElementTree.fromstring(text)))
     else:
         matrix = numbers_of(text)
-        fields = {"K": matrix} if matrix else yaml_keys(path.read_text(encoding="utf-8-sig"))
+        fields = {"K": matrix} if matrix else yaml_keys(path)
     return of_keys(fields, size, path)
 
 
@@ -187,19 +187,20 @@ def _of_colmap(path: Path, lines: Sequence[str], size: Size) -> Calibration:
     return of_keys({"model": name, **dict(zip(keys, told, strict=True))})
 
 
-def yaml_keys(text: str) -> dict[str, object]:
-    """The keys of YAML, of nested ones joined by dots, and their numbers, lists or words; of the
-    first of several cameras or IMUs. Raises ValueError for what is no YAML."""
+def yaml_keys(path: Path) -> dict[str, object]:
+    """The keys of a YAML file, of nested ones joined by dots, and their numbers, lists or words; of
+    the first of several cameras or IMUs. Raises ValueError, naming a file that is none."""
     try:
         import yaml
     except ImportError as error:
-        raise missing("YAML needs", "vision", error) from None
+        raise missing(f"{path}: YAML needs", "vision", error) from None
     # OpenCV's directive and types are its own.
-    told = re.sub(r"^%.*|!!\S+", "", text, flags=re.MULTILINE).expandtabs()
+    text = path.read_text(encoding="utf-8-sig", errors="replace").expandtabs()
+    told = re.sub(r"^%.*|!!\S+", "", text, flags=re.MULTILINE)
     try:
         fields = next(iter(yaml.safe_load_all(told)), None)
     except yaml.YAMLError as error:
-        raise ValueError(f"not a YAML file ({one_line(error)})") from None
+        raise ValueError(f"{path}: not a YAML file ({one_line(error)})") from None
     result: dict[str, object] = {}
     for name, value in _flat(fields if isinstance(fields, dict) else {}).items():
         result.setdefault(re.sub(r"(^|\.)([Cc]am(?:era)?|imu)\d+\.", r"\1", name), value)

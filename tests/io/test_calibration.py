@@ -350,6 +350,7 @@ def other(name, old, new):
             ("agisoft.xml", "<c><width>640</width><f>525</f><cx>-11</cx><k1>0.1</k1></c>"),
             "no camera matrix of finite .*, and no fx, fy, cx, cy; its keys are width, f, cx, k1",
         ),
+        (("broken.yaml", "width: [1, 2\nK: 3\n"), "broken.yaml: not a YAML file"),
         (("broken.xml", "<c><width>640</c>"), "mismatched tag"),
         (("ost.txt", "# oST\n[image]\nwidth\n640\n"), "no camera matrix of finite numbers"),
     ],
