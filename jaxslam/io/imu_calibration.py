@@ -45,9 +45,9 @@ class InertialCalibration(NamedTuple):
     """The bias, m/s³/√Hz."""
     camera_from_imu: Float[np.ndarray, "4 4"]
     """T_CI (m): a point p in the IMU's axes is T_CI p in those of the camera."""
-    clock_offset: float = 0.0
+    clock_offset: float | None = None
     """Seconds by which the clock of the IMU is ahead of the camera's, `t_imu = t_cam + offset`, as
-    Kalibr's `timeshift_cam_imu`."""
+    Kalibr's `timeshift_cam_imu`; None where that is not stated."""
 
     def compared(self, log: InertialLog) -> tuple[str, ...]:
         """A sentence for each density of white noise that is five times more, or less, than that of
@@ -105,7 +105,7 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
         told = f"{', '.join(uneven)} of the IMU are not applied to its readings"
         warnings.warn(f"{place}: {told}; apply them before", stacklevel=2)
     shift = numbers_of((sensor | mount).get("timeshift_cam_imu"))
-    return InertialCalibration(*densities, T_CI, shift[0] if shift else 0.0)
+    return InertialCalibration(*densities, T_CI, shift[0] if shift else None)
 
 
 def _density(place: str, fields: dict[str, object], name: str) -> float:

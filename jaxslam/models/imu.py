@@ -60,6 +60,8 @@ class Increments(eqx.Module):
     """Derivative of (Log ΔR, Δv, Δp), on the right of ΔR, by the biases."""
     by_noise: Float[Array, "9 12"]
     """The same by the white noise, of unit density."""
+    by_clock: Float[Array, " 9"]
+    """The same by a shift of the whole step to later readings, 1/s."""
 
 
 class InertialState(eqx.Module):
@@ -75,6 +77,8 @@ class InertialState(eqx.Module):
     """The direction of gravity; its length means nothing, as that of a homogeneous point."""
     mount: Float[Array, " m"]
     """The tangent by which T_CI is off, on its right, m and rad; empty where that is known."""
+    clock: Float[Array, " c"]
+    """Seconds by which the unit's clock is ahead, beside what is known; empty where nothing is."""
 
     @property
     def bias(self) -> Float[Array, " 6"]:
@@ -103,22 +107,20 @@ def increments(
     total = jnp.sum(seconds)
     slope = _slope(seconds, total)
 
-    def change(off: Float[Array, " 6"], force_off: Float[Array, " 6"]) -> Float[Array, " 9"]:
-        """Of errors that stay in the step, and of their slopes, in either sensor."""
-        of_rates, of_forces = (x[:3] + jnp.outer(slope, x[3:]) for x in (off, force_off))
-        to, by, at = _integrated(seconds, rates - of_rates, forces - of_forces)
+    def change(off: Float[Array, " 6"], sloped: Float[Array, " 6"], later: Scalar) -> Array:
+        """Of errors that stay in the step, and of their slopes, in both sensors; and of a step
+        that begins and ends so many seconds later."""
+        read = jnp.concatenate([rates, forces], axis=1) - off - jnp.outer(slope, sloped)
+        last = jnp.max(jnp.flatnonzero(seconds, size=len(seconds)))
+        held = seconds.at[0].add(-later).at[last].add(later)
+        to, by, at = _integrated(held, read[:, :3], read[:, 3:])
         return jnp.concatenate([log(turned.inverse() @ to), by, at])
 
     none = jnp.zeros(6, seconds.dtype)
-    # Each sensor by itself: an error of the forces turns nothing.
-    by_rates, by_forces = jax.jacfwd(change, argnums=(0, 1))(none, none)
-    by_bias, by_slope = (
-        jnp.concatenate([by_rates[:, part], by_forces[:, part]], axis=1)
-        for part in (slice(0, 3), slice(3, 6))
-    )
+    by_bias, by_slope, by_clock = jax.jacfwd(change, (0, 1, 2))(none, none, none[0])
     by_mean = by_bias / jnp.sqrt(jnp.where(total > 0, total, 1.0))
     by_noise = jnp.concatenate([by_mean, by_slope], axis=1)
-    return Increments(total, turned, sped, moved, bias, by_bias, by_noise)
+    return Increments(total, turned, sped, moved, bias, by_bias, by_noise, by_clock)
 
 
 def _integrated(
@@ -171,13 +173,16 @@ class Imu(AbstractMotion):
     start_sigma: Float[AnyArray, " 2"] = number_field(default=(1.0, 0.1))
     """σ of each number of the velocity, m/s, and of gravity's direction about each axis, rad."""
     root: Float[AnyArray, "v v"] | None = eqx.field(default=None, converter=optional_numbers)
-    """R of the covariance `R Rᵀ` of velocity, biases, direction and mount, in place of all σ."""
+    """R of the covariance `R Rᵀ` of velocity, biases, direction, mount and clock, in place of all
+    σ."""
     camera_from_imu: Float[AnyArray, "4 4"] = number_field(
         default=tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
     )
     """T_CI, the pose of the unit in the camera."""
     mount_sigma: Float[AnyArray, " m"] = number_field(default=())
     """σ of its position, m, and rotation, rad, about the unit's axes, where they are estimated."""
+    clock_sigma: Float[AnyArray, " c"] = number_field(default=())
+    """σ of the offset between the clocks of unit and camera, s, where it is estimated."""
     gravity: Number = number_field(default=9.81)
     """m/s²."""
     readings: int = eqx.field(static=True, default=40)
@@ -189,6 +194,7 @@ class Imu(AbstractMotion):
         for name, shape in shapes.items():
             check_shape(f"{name} of an Imu", getattr(self, name), shape)
         check_shape("mount_sigma of an Imu", self.mount_sigma, (0,), (6,))
+        check_shape("clock_sigma of an Imu", self.clock_sigma, (0,), (1,))
 
     @property
     def geometry(self) -> Geometry:
@@ -205,15 +211,16 @@ class Imu(AbstractMotion):
         return jnp.concatenate([white, white, walk])
 
     def start(self) -> tuple[InertialState, Float[Array, "v v"]]:
-        bias, down, off = map(jnp.asarray, (self.bias, self.down, self.mount_sigma))
-        velocity = jnp.asarray(self.velocity)
-        variables = InertialState(velocity, bias[:3], bias[3:], down, jnp.zeros_like(off))
+        numbers = self.velocity, self.bias, self.down, self.mount_sigma, self.clock_sigma
+        velocity, bias, down, *rest = map(jnp.asarray, numbers)
+        variables = InertialState(velocity, bias[:3], bias[3:], down, *map(jnp.zeros_like, rest))
         if self.root is not None:
             return variables, jnp.asarray(self.root)
         of_velocity, of_down = self.start_sigma
         sigma = jnp.repeat(jnp.stack([of_velocity, *self.bias_sigma]), 3)
         across = (jnp.eye(3, dtype=down.dtype) - jnp.outer(down, down)) * of_down
-        return variables, jax.scipy.linalg.block_diag(jnp.diag(sigma), across, jnp.diag(off))
+        diagonal = map(jnp.diag, (sigma, *rest))
+        return variables, jax.scipy.linalg.block_diag(next(diagonal), across, *diagonal)
 
     def begun(self, variables: InertialState, root: Float[Array, "v v"]) -> Imu:
         v = variables
@@ -231,6 +238,7 @@ class Imu(AbstractMotion):
         walked = noise[_WHITE:] * root
         off = variables.bias + walked / 2 - control.bias
         error = control.by_bias @ off + control.by_noise @ noise[:_WHITE]
+        error += control.by_clock * jnp.sum(variables.clock)
         pull = self.gravity * T * variables.down / jnp.linalg.norm(variables.down)
         sped = control.sped + error[3:6] + pull
         moved = control.moved + error[6:] + (variables.velocity + pull / 2) * T
@@ -266,12 +274,10 @@ class Imu(AbstractMotion):
 
     def still(self, dtype: DTypeLike | None = None) -> Increments:
         dtype = dtype or jnp.result_type(float)
-
-        def zeros(*shape):
-            return jnp.zeros(shape, dtype)
-
         turned = jaxlie.SO3(jnp.array([1.0, 0.0, 0.0, 0.0], dtype))
-        return Increments(zeros(), turned, zeros(3), zeros(3), zeros(6), zeros(9, 6), zeros(9, 12))
+        shapes = (), (3,), (3,), (6,), (9, 6), (9, 12), (9,)
+        seconds, *rest = (jnp.zeros(shape, dtype) for shape in shapes)
+        return Increments(seconds, turned, *rest)
 
     def along(
         self, path: Pose, seconds: Scalar, down: Vector | None, key: Array
@@ -333,19 +339,13 @@ class Imu(AbstractMotion):
         told = replace(mean, velocity=back @ velocity, down=back @ down)
         if self.root is None:  # of this direction
             root = replace(self, down=told.down).start()[1]
-        off = root @ jax.random.normal(key, root.shape[:1], root.dtype)
-        off = retract(jax.tree.map(jnp.zeros_like, mean), off)
-        direction = told.down + off.down
+        drawn = retract(mean, root @ jax.random.normal(key, root.shape[:1], root.dtype))
         truth = replace(
-            told,
-            gyroscope_bias=mean.gyroscope_bias + off.gyroscope_bias,
-            accelerometer_bias=mean.accelerometer_bias + off.accelerometer_bias,
+            told, gyroscope_bias=drawn.gyroscope_bias, accelerometer_bias=drawn.accelerometer_bias
         )
-        told = replace(
-            told,
-            velocity=told.velocity - off.velocity,
-            down=direction / jnp.linalg.norm(direction),
-        )
+        direction = told.down + drawn.down - mean.down
+        velocity = told.velocity + mean.velocity - drawn.velocity
+        told = replace(told, velocity=velocity, down=direction / jnp.linalg.norm(direction))
         root = replace(self, down=told.down).start()[1]
         return truth, self.begun(told, root)
 

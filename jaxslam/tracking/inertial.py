@@ -20,6 +20,8 @@ BEGINNING = 1.0
 BIAS_SIGMA = 0.05, 0.2
 """σ of the biases of a gyroscope, rad/s, and of an accelerometer, m/s², of which nothing is known:
 those of telephones and of units for robots."""
+CLOCK_SIGMA = 5e-3
+"""σ of the offset between two clocks of which nothing is known, s."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ class Inertial:
             density = c.gyroscope_noise_density, c.accelerometer_noise_density
             walk = c.gyroscope_random_walk, c.accelerometer_random_walk
             imu = Imu(density, walk=walk, bias_sigma=BIAS_SIGMA, camera_from_imu=c.camera_from_imu)
+            if clock_offset is None:
+                imu = replace(imu, clock_sigma=(CLOCK_SIGMA,))
         assert isinstance(imu, Imu)
         made = cls(log, imu, clock_offset or 0.0)
         begin, until = float(times[0]), float(min(times[0] + BEGINNING, times[-1]))

@@ -59,8 +59,8 @@ def begun(source: Source, inertial: Inertial, settings: TrackerSettings) -> tupl
     try:
         if last >= len(source.times):
             raise ValueError(f"the video is shorter than {WINDOW} s")
-        controls = [inertial.control(*map(float, step)) for step in itertools.pairwise(times)]
         with jax.enable_x64(True):
+            controls = [inertial.control(*map(float, step)) for step in itertools.pairwise(times)]
             seen = tracks(pictures, settings)[which]
             imu = start_in_motion(inertial.imu, controls, seen, source.calibration, settings)
     except ValueError as error:

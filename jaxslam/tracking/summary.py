@@ -130,19 +130,16 @@ def describe(summary: Summary) -> str:
     ]
     if summary["lost"]:
         reasons = (f"{count} {reason}" for reason, count in summary["lost_reasons"].items())
-        frames = "1 frame" if summary["lost"] == 1 else f"{summary['lost']} frames"
-        lines.append(f"{frames} lost: {', '.join(reasons)}")
+        lines.append(f"lost frames: {summary['lost']} ({', '.join(reasons)})")
     if summary["repeated"]:
         lines.append(
             f"{summary['repeated']} pictures repeat the one before and were not used: is the rate "
             "of the video higher than the camera's?"
         )
     if summary["relocalised"]:
-        times = "once" if summary["relocalised"] == 1 else f"{summary['relocalised']} times"
-        lines.append(f"relocalised {times} in an earlier map")
+        lines.append(f"relocalised in an earlier map: {summary['relocalised']} ×")
     if summary["loops"]:
-        loops = "1 loop" if summary["loops"] == 1 else f"{summary['loops']} loops"
-        lines.append(f"{loops} closed; all poses were corrected")
+        lines.append(f"closed loops: {summary['loops']}; all poses were corrected")
     for one in summary["joined"]:
         lines.append(
             f"map {one['map']} was joined to map {one['to']}; the ratio of their units is known to "

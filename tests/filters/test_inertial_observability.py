@@ -29,7 +29,8 @@ def jacobian_of_pixels():
     """`controls ↦ ∂(all pixels)/∂(variables at the start, points)`."""
     imu, none, noise = Imu((0.0, 0.0)), jnp.zeros(3), jnp.zeros(18)
     points = np.random.default_rng(5).uniform([-4, -4, 4], [4, 4, 12], (POINTS, 3))
-    start = InertialState(jnp.array([0.4, -0.2, 0.6]), none, none, jnp.asarray(DOWN), jnp.zeros(0))
+    empty = jnp.zeros(0)
+    start = InertialState(jnp.array([0.4, -0.2, 0.6]), none, none, jnp.asarray(DOWN), empty, empty)
 
     def pixels(unknown, controls):
         there = points + unknown[12:].reshape(POINTS, 3)

@@ -15,6 +15,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import difference, exp, jacobian, log
+from jaxslam.io.imu import InertialLog
 from jaxslam.models.imu import Imu, increments
 from jaxslam.models.motion import check_control
 from jaxslam.simulation import scenario, simulate
@@ -104,6 +105,35 @@ def test_another_bias_changes_increments_as_they_say_to_second_order():
         )  # fmt: skip
         assert np.abs(errors[-1]).max() < 0.01 * np.abs(by).max()
     np.testing.assert_allclose(np.linalg.norm(errors[0]) / np.linalg.norm(errors[1]), 4, rtol=0.05)
+
+
+@pytest.mark.parametrize("more", [0, 3])
+def test_a_clock_that_is_ahead_shifts_the_step(more):
+    """As the log's own readings between the shifted ends do, to second order; readings of no
+    seconds behind the others change nothing."""
+    t = np.linspace(0.0, 1.0, 1001)[:, None]
+    turn, force = RATES + np.sin(9 * t + np.arange(3)), FORCE + np.cos(7 * t + np.arange(3))
+    log_of = InertialLog(t[:, 0], turn, force, "imu.csv")
+
+    def between(later):
+        read = log_of.between(0.312 + later, 0.447 + later)
+        return compiled()(*(np.pad(x, ((0, more), (0, 0))[: x.ndim]) for x in read))
+
+    def change(h):
+        ends = between(-h), between(h)
+        of_turn = log(ends[0].turned.inverse() @ ends[1].turned)
+        both = ((x.sped, x.moved) for x in ends)
+        return np.concatenate([of_turn, *(b - a for a, b in zip(*both, strict=True))]) / (2 * h)
+
+    np.testing.assert_allclose(between(0.0).by_clock, change(1e-4), atol=2e-2, rtol=2e-2)
+    imu = an_imu(clock_sigma=[5e-3])
+    for shift in (1e-3, -1e-3):
+        now = replace(variables(imu), clock=jnp.array([shift]))
+        told = imu.displacement(now, 0 * NOISE, between(0.0))
+        true = imu.displacement(variables(imu), 0 * NOISE, between(shift))
+        without = imu.displacement(variables(imu), 0 * NOISE, between(0.0))
+        off = [np.linalg.norm(log(true.inverse() @ x)) for x in (told, without)]
+        assert off[0] < 0.02 * off[1]
 
 
 def test_the_noise_of_a_step_has_the_covariance_of_white_noise_in_every_reading():

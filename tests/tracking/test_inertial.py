@@ -17,6 +17,7 @@ from jaxslam.io.calibration import write_calibration
 from jaxslam.io.tum import write_tum
 from jaxslam.models.imu import Increments
 from jaxslam.tracking.inertial import Inertial
+from jaxslam.tracking.moving_start import begun
 from jaxslam.tracking.settings import INERTIAL, TrackerSettings
 from jaxslam.tracking.tracker import Tracker
 
@@ -60,6 +61,21 @@ def test_a_clock_offset_moves_the_readings(short):
 def test_a_film_from_other_times_than_its_readings_is_refused(short):
     with pytest.raises(ValueError, match=r"from frame 0 to 1: .* the clocks differ"):
         Inertial.of(short.log, UNIT, short.source.times + 50)
+
+
+def test_a_start_in_motion_is_found_by_who_has_numbers_of_32_bits():
+    of = film(12, 0.0, seconds=2.0, rate=10.0, width=320)
+    inertial = Inertial.of(of.log, replace(UNIT, clock_sigma=[5e-3]), of.source.times)
+    assert inertial.why_moving
+    with jax.enable_x64(False):
+        rest, started = begun(of.source, inertial, SMALL)
+    assert rest.times[0] == pytest.approx(1.5)
+    assert of.source.reference is not None
+    k, h = 15, 0.1
+    before, now, after = of.source.reference.T_wc[k - 1 : k + 2] @ T_CI
+    velocity = now[:3, :3].T @ (after - before)[:3, 3] / (2 * h)
+    # The difference of two pictures is not quite the velocity.
+    np.testing.assert_allclose(started.imu.velocity, velocity, atol=0.05)
 
 
 @pytest.mark.slow

@@ -183,7 +183,7 @@ def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
     assert [(unit["map"], unit["fixed_at"]) for unit in summary["units"]] == [(0, 0), (1, LIGHT)]
     assert (summary["tracked"], summary["lost"]) == (END - 5, 5)
     assert [row["reason"] for row in rows] == ["few agree" if state else "" for state in lost]
-    assert "5 frames lost: 5 few agree" in describe(summary)
+    assert "lost frames: 5 (5 few agree)" in describe(summary)
     # σ/ρ of the prior on an inverse depth is ½, in each of the two maps.
     assert summary["log_scale_sigma_between_maps"] == pytest.approx(np.sqrt(0.5), rel=1e-12)
     assert "2 maps, each with its own unit" in describe(summary)

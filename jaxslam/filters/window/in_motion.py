@@ -49,27 +49,32 @@ class InertialWindow(eqx.Module):
     def size(self) -> int:
         """The number of unknowns."""
         frames, m, _ = self.pixels.shape
-        return 12 + 18 * (frames - 1) + 3 * m
+        return self.of_start + 18 * (frames - 1) + 3 * m
+
+    @property
+    def of_start(self) -> int:
+        """Those of the start, the first."""
+        return len(self.imu.start()[1])
 
     def path(self, x: Float[Array, " n"]) -> tuple[Pose, InertialState]:
         """The cameras after every step, in the first one, and the variables at the end."""
         mean, root = self.imu.start()
-        steps = len(self.pixels) - 1
-        noise = x[12 : 12 + 18 * steps].reshape(steps, 18) * self.imu.noise_sigma
+        steps, k = len(self.pixels) - 1, self.of_start
+        noise = x[k : k + 18 * steps].reshape(steps, 18) * self.imu.noise_sigma
 
         def move(carry, step):
             pose, now = carry
             pose = pose @ self.imu.displacement(now, *step)
             return (pose, self.imu.next(now, *step)), pose
 
-        start = identity(SPATIAL, x.dtype), retract(mean, root @ x[:12])
+        start = identity(SPATIAL, x.dtype), retract(mean, root @ x[:k])
         (_, end), poses = jax.lax.scan(move, start, (noise, self.controls))
         return poses, end
 
     def errors(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
         """All errors by their σ; zero of what was not seen."""
         poses, _ = self.path(x)
-        own = x[12 + 18 * (len(self.pixels) - 1) :].reshape(-1, 3)
+        own = x[-3 * self.pixels.shape[1] :].reshape(-1, 3)
         first = self.pixels[0] + self.pixel_sigma * own[:, 1:]
         rays = jax.vmap(lambda pixel: ray(self.camera, pixel))(first)
         omega = self.depth.mean + self.depth.sigma * own[:, :1]
