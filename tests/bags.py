@@ -97,12 +97,13 @@ class Ros:
     def compressed(self, t, data, form="jpeg"):
         return self.make("sensor_msgs/CompressedImage", self.header(t), form, np.ravel(data))
 
-    def camera_info(self, t, size, K, D, model="plumb_bob", P=None):
+    def camera_info(self, t, size, K, D, model="plumb_bob", P=None, part=(0,) * 6):
         P = np.zeros(12) if P is None else np.asarray(P, float).ravel()
-        roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
+        x, y, width, height, *binned = part
+        roi = self.make("sensor_msgs/RegionOfInterest", x, y, height, width, False)
         return self.make(
             "sensor_msgs/CameraInfo", self.header(t), *size, model,
-            np.array(D, float), np.ravel(K).astype(float), np.eye(3).ravel(), P, 0, 0, roi,
+            np.array(D, float), np.ravel(K).astype(float), np.eye(3).ravel(), P, *binned, roi,
         )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Small pictures for tests of what reads them."""
 
+import struct
+
 import cv2
 import numpy as np
 
@@ -20,3 +22,13 @@ def write_pictures(folder, names):
 
 def brightness(source):
     return [int(frame.image[0, 0]) for frame in source]
+
+
+def jpeg(image, orientation=1, order="<"):
+    """The bytes of a JPEG with an EXIF orientation, its number in this order of bytes."""
+    entry = struct.pack(f"{order}HHIHH", 0x0112, 3, 1, orientation, 0)
+    mark = b"II" if order == "<" else b"MM"
+    tiff = mark + struct.pack(f"{order}HIH", 42, 8, 1) + entry + bytes(4)
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    exif = b"Exif\0\0" + tiff
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]

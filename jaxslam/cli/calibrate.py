@@ -14,7 +14,7 @@ from jaxslam.cli.extra import one_line_warnings, require_vision
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Options of the command; every field is an option."""
+    """Calibrate a camera, with uncertainty, from a video of a board."""
 
     board_video: Annotated[
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="BOARD_VIDEO")
@@ -35,30 +35,23 @@ class CalibrateOptions:
     """Output folder for calibration.json and coverage.png, or for board.png."""
 
     def run(self) -> None:
-        """Calibrate, print the numbers, write the files."""
+        """Calibrate, print the numbers, write the files; or draw the board."""
         require_vision("calibrating")
+        import cv2
+
+        from jaxslam._runtime.progress import bar
         from jaxslam.io.board import Board
+        from jaxslam.io.calibrate import calibrate, describe, write
 
         board = Board(self.board, self.columns, self.rows, self.square, self.dictionary)
         if self.board_video is None:
-            self._draw(board)
-        else:
-            self._calibrate(board, self.board_video)
-
-    def _draw(self, board) -> None:
-        import cv2
-
-        self.out.mkdir(parents=True, exist_ok=True)
-        with write_atomically(self.out / "board.png") as path:
-            cv2.imwrite(str(path), board.drawn())
-        print(f"wrote {self.out / 'board.png'}: print it and measure a square")
-
-    def _calibrate(self, board, video: Path) -> None:
-        from jaxslam._runtime.progress import bar
-        from jaxslam.io.calibrate import calibrate, describe, write
-
+            self.out.mkdir(parents=True, exist_ok=True)
+            with write_atomically(self.out / "board.png") as path:
+                cv2.imwrite(str(path), board.drawn())
+            print(f"wrote {self.out / 'board.png'}: print it and measure a square")
+            return
         with one_line_warnings(), bar(None, "picture") as shown:
-            calibrated = calibrate(video, board, shown.update)
+            calibrated = calibrate(self.board_video, board, shown.update)
         write(calibrated, board, self.out)
         print(describe(calibrated))
         print(f"wrote calibration.json and coverage.png to {self.out}")

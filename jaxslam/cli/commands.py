@@ -12,23 +12,17 @@ from jaxslam.cli.evaluate import EvaluateOptions
 from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
-_COMMANDS = {
-    "consistency": (ConsistencyOptions, "Simulate many runs of filters: are they consistent?"),
-    "evaluate": (EvaluateOptions, "Test the consistency of your own filter from its errors."),
-    "track": (TrackOptions, "Track a camera through a video: trajectory, map, overlay."),
-    "calibrate": (
-        CalibrateOptions,
-        "Calibrate a camera, with uncertainty, from a video of a board.",
-    ),
-    "triangulate": (
-        TriangulateOptions,
-        "How well do two views determine a depth, and is the estimate consistent?",
-    ),
-}
+_COMMANDS = (
+    ConsistencyOptions, EvaluateOptions, TrackOptions, CalibrateOptions, TriangulateOptions,
+)  # fmt: skip
+"""A command is called by its class without `Options`; every field is an option of it, and its
+docstring says what it does."""
+
+
 Command: Any = Union[  # noqa: UP007 (of a table)
     tuple(
-        Annotated[options, tyro.conf.subcommand(name, description=told)]
-        for name, (options, told) in _COMMANDS.items()
+        Annotated[x, tyro.conf.subcommand(x.__name__[:-7].lower(), description=x.__doc__)]
+        for x in _COMMANDS
     )
 ]
 

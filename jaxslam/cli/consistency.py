@@ -21,7 +21,7 @@ from jaxslam.simulation.scenario import parse_override
 
 @dataclass(frozen=True)
 class ConsistencyOptions:
-    """Options of the command; every field is an option."""
+    """Simulate many runs of filters, and test whether they are consistent."""
 
     scenario: Annotated[
         str,

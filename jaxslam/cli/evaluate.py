@@ -12,6 +12,7 @@ import tyro
 
 from jaxslam._runtime.files import Json, json_numbers, write_atomically, write_json
 from jaxslam.cli.consistency import ConsistencyOptions
+from jaxslam.cli.extra import seconds
 from jaxslam.consistency.suite import SUITE, SuiteScenario, read_suite, write_suite
 from jaxslam.consistency.summary import summarise
 from jaxslam.evaluation import CHOICES, Convention, Evaluation, evaluate_poses
@@ -27,7 +28,7 @@ _OF_ONE_LOG = (
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Options of the command; every field is an option."""
+    """Test the consistency of your own filter from its errors."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz (or .mat) with errors and
@@ -62,8 +63,9 @@ class EvaluateOptions:
     """How the estimate is aligned with the truth: none, first (at the first pose), yaw (position
     and yaw, which no camera with an IMU knows), se3 or sim3. The last three use the first pose
     where its σ is small, otherwise all poses."""
-    time_offset: Annotated[str, tyro.conf.arg(metavar="SECONDS|auto")] = "0"
-    """By how much the estimate's stamps are late; auto finds it by the rotations of both."""
+    time_offset: Annotated[str, tyro.conf.arg(metavar="TIME|auto")] = "0"
+    """By how much the estimate's stamps are late, such as 50ms; auto finds it by the rotations of
+    both."""
     axes_used: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
     """Axes that the filter estimates, such as x,y,rz for a robot in the plane. Default: all axes
     whose errors are not always zero."""
@@ -172,18 +174,9 @@ class EvaluateOptions:
         if self.source is None:
             raise ValueError("no SOURCE given; expected a log, or --suite FOLDER")
         of_log = {name: getattr(self, name) for name in (*_OF_ONE_LOG, "align", "axes_used")}
-        of_log["time_offset"] = _seconds(self.time_offset)
+        own = self.time_offset
+        of_log["time_offset"] = own if own == "auto" else seconds("--time-offset", own)
         return evaluate_log(self.source, stated=self._stated(), **of_log)
-
-
-def _seconds(told: str) -> float | str:
-    try:
-        offset = 0.0 if told == "auto" else float(told)
-    except ValueError:
-        offset = np.nan
-    if not np.isfinite(offset):
-        raise ValueError(f"--time-offset must be seconds, or auto, not {told}")
-    return "auto" if told == "auto" else offset
 
 
 def _comparison(title: str, filters: dict[str, Json]) -> list[str]:

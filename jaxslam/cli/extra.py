@@ -1,8 +1,10 @@
-"""The imports and the one-line warnings that the commands on pictures share."""
+"""What commands share: imports of pictures, one-line warnings, times with a unit."""
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Generator
@@ -30,3 +32,13 @@ def one_line_warnings() -> Generator[None]:
         yield
     for warning in caught:
         print(f"jaxslam: warning: {warning.message}", file=sys.stderr)
+
+
+def seconds(option: str, time: str) -> float:
+    """The seconds of a time with a unit, or of a number. Raises ValueError, naming the option."""
+    found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(s|ms|us|µs|)\s*", time)
+    units = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+    value = math.inf if found is None else float(found[1]) * units[found[2]]
+    if not abs(value) < math.inf:
+        raise ValueError(f"{option} is a time such as 20ms or 0.02s, not {time!r}")
+    return value

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.cli.extra import one_line_warnings, require_vision
+from jaxslam.cli.extra import one_line_warnings, require_vision, seconds
 from jaxslam.filters.association import ASSOCIATIONS
 from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
@@ -19,7 +18,7 @@ from jaxslam.tracking.settings import METRIC, TrackerSettings
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of the command; every field is an option."""
+    """Track a camera through a video: trajectory, map, overlay."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes),
@@ -29,7 +28,7 @@ class TrackOptions:
     calibration: Path | None = None
     """Camera calibration, a JSON file with model (pinhole, rational or fisheye), width, height, fx,
     fy, cx, cy and distortion (in OpenCV's order), or a file of OpenCV, ROS, Kalibr, EuRoC, TUM-VI,
-    ORB-SLAM or COLMAP."""
+    ORB-SLAM, COLMAP or another program (docs/own-video.md)."""
     fov: float | None = None
     """Horizontal field of view in degrees, in place of a calibration; focal length, centre and
     distortion (k1, k2) of the lens are then estimated.
@@ -148,15 +147,11 @@ class TrackOptions:
         from jaxslam.tracking.synthetic import synthetic_source
 
         if self.source is not None:
+            names = ("calibration", "fov", "reference", "rate", "start", "every", "frames")
+            how: Any = {name: getattr(self, name) for name in names}
             return open_source(
                 self.source if self.topic is None else f"{self.source}:{self.topic}",
-                calibration=self.calibration,
-                fov=self.fov,
-                reference=self.reference,
-                rate=self.rate,
-                start=self.start,
-                every=self.every,
-                frames=self.frames,
+                **how,
                 # A target's pixels are those of the pictures as they are.
                 scale=1.0 if self.scale is None and self.target else self.scale,
             )
@@ -199,23 +194,11 @@ class TrackOptions:
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None
+        own: Any = {x.name: getattr(self, x.name, x.default) for x in fields(TrackerSettings)}
         return TrackerSettings(
-            filter=METRIC if metric else self.filter,
-            landmarks=self.landmarks,
-            calibration=self.calibration_treatment,
-            nearest_depth=self.nearest_depth,
-            pixel_sigma=self.pixel_sigma,
-            readout=_seconds(self.readout),
-            acceleration_sigma=self.acceleration_sigma,
-            angular_acceleration_sigma=self.angular_acceleration_sigma,
-            association=self.association,
-            wanted=self.wanted,
-        )
-
-
-def _seconds(time: str) -> float:
-    """The seconds of a time with a unit. Raises ValueError."""
-    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*(s|ms|us|µs|)\s*", time)
-    if found is None:
-        raise ValueError(f"--readout is a time such as 20ms or 0.02s, not {time!r}")
-    return float(found[1]) * {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}[found[2]]
+            **own | {
+                "filter": METRIC if metric else self.filter,
+                "calibration": self.calibration_treatment,
+                "readout": seconds("--readout", self.readout),
+            }
+        )  # fmt: skip

@@ -23,7 +23,7 @@ from jaxslam.triangulation import (
 
 @dataclass(frozen=True)
 class TriangulateOptions:
-    """Options of the command; every field is an option."""
+    """Show how well two views determine a depth, and whether the estimate is consistent."""
 
     depth: float = TwoViews.depth
     """True depth of the point, m."""

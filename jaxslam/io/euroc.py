@@ -26,10 +26,9 @@ KEY = "T_BS.data"
 
 
 def _open(path: Path, _rate: float) -> Recording:
-    root = _root(path)
-    camera = root / "cam0"
-    listing = camera / "data.csv"
-    times, names = read_timestamps(listing, NANOSECONDS, ",")
+    camera = _camera(path) or path
+    root, listing = camera.parent, camera / "data.csv"
+    times, names = read_timestamps(listing)
     files = listed(listing, camera / "data", names)
     yaml, truth = camera / "sensor.yaml", root / TRUTH / "data.csv"
     lenses = (x for x in (yaml, path / "dso" / "camchain.yaml") if x.is_file())  # or TUM-VI's
@@ -38,14 +37,15 @@ def _open(path: Path, _rate: float) -> Recording:
     return of_files(path, files, times, calibration, reference)
 
 
-def _root(path: Path) -> Path:
-    """The folder with `cam0`: `mav0`, or the one given."""
-    return path / "mav0" if (path / "mav0").is_dir() else path
+def _camera(path: Path) -> Path | None:
+    """The folder of the camera: `mav0/cam0`, `cam0`, or the one given."""
+    places = (path / "mav0" / "cam0", path / "cam0", path)
+    return next((x for x in places if (x / "data.csv").is_file() and (x / "data").is_dir()), None)
 
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
-    T_BS = pose_of_keys(yaml, yaml_keys(yaml.read_text(encoding="utf-8-sig")), {KEY: False})
+    T_BS = pose_of_keys(yaml, yaml_keys(yaml), {KEY: False})
     if T_BS is None:
         raise ValueError(f"{yaml}: {KEY}: [16 finite numbers] is missing")
     columns = "eight finite numbers ns px py pz qw qx qy qz"
@@ -54,6 +54,4 @@ def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     return Trajectory(rows[:, 0] / NANOSECONDS, rows_as_poses(table.place, rows) @ T_BS)
 
 
-EUROC = Layout(
-    "EuRoC (mav0/cam0/data.csv)", lambda path: (_root(path) / "cam0" / "data.csv").is_file(), _open
-)
+EUROC = Layout("EuRoC (mav0/cam0/data.csv)", lambda path: _camera(path) is not None, _open)

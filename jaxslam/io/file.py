@@ -1,5 +1,6 @@
 """A video file, with the times that it gives its pictures itself."""
 
+import itertools
 import math
 import warnings
 from collections.abc import Generator, Iterator
@@ -10,15 +11,21 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.pictures import as_grey
+from jaxslam.io.pictures import as_grey, of_eight_bits
 from jaxslam.io.recording import Layout, Recording
-from jaxslam.io.source import Image
 
+_GREY_16 = int.from_bytes(b"Y1\0\x10", "little")
+"""FFmpeg's name of grey pictures of 16 bits."""
 VIDEO_TYPES = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".mpg", ".mpeg")
 
 
 def _open(path: Path, _rate: float) -> Recording:
-    return Recording(path.name, read_times(path), lambda: _images(path))
+    times = read_times(path)
+
+    def images(every: int) -> Iterator[np.ndarray]:
+        return itertools.islice(_images(path), 0, None, every)
+
+    return Recording(path.name, times, of_eight_bits(path.name, images, len(times)))
 
 
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
@@ -63,13 +70,15 @@ def opened(where: Path | int) -> Generator[cv2.VideoCapture]:
         capture.release()
 
 
-def _images(path: Path) -> Iterator[Image]:
+def _images(path: Path) -> Iterator[np.ndarray]:
     with opened(path) as capture:
+        if int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GREY_16:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # which would leave the upper 8 bits
         while True:
             found, image = capture.read()
             if not found:
                 return
-            yield as_grey(image)
+            yield image if image.dtype == np.uint16 else as_grey(image)
 
 
 VIDEO = Layout(

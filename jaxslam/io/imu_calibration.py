@@ -90,7 +90,7 @@ def read_inertial_calibration(*paths: str | Path) -> InertialCalibration:
     mount: dict[str, object] = {}
     for file in files:
         text_lines(file, "calibration")  # which says what cannot be read
-        fields = yaml_keys(file.read_text(encoding="utf-8-sig", errors="replace"))
+        fields = yaml_keys(file)
         (sensor if _DENSITIES.keys() & fields.keys() else mount).update(fields)
     place = ", ".join(map(str, files or paths))
     densities = [_density(place, sensor, name) for name in _DENSITIES]

@@ -14,10 +14,10 @@ from jaxslam.io.recording import (
     Calibrator,
     Layout,
     Recording,
-    check_increasing,
     check_rigid,
     image_files,
     of_files,
+    read_timestamps,
 )
 from jaxslam.io.source import Trajectory
 from jaxslam.io.text import read_table, rows_of, text_lines
@@ -29,22 +29,13 @@ CAMERAS = ("0", "2")
 def _open(path: Path, _rate: float) -> Recording:
     camera = next(number for number in CAMERAS if (path / f"image_{number}").is_dir())
     files = image_files(path / f"image_{camera}")
-    times = _read_times(path / "times.txt")
-    _check_count(path / "times.txt", len(times), len(files))
+    times, _ = read_timestamps(path / "times.txt")
     calib = path / "calib.txt"
     projection = _projection(calib, camera) if calib.is_file() else None
     calibration = None if projection is None else _calibrator(projection)
     truth = next((file for file in _poses_of(path) if file.is_file()), None)
     reference = None if truth is None else _camera_truth(truth, times, projection)
     return of_files(path, files, times, calibration, reference)
-
-
-def _read_times(path: Path) -> Times:
-    expected = "finite times in seconds"
-    table = read_table(path, "times", "times", expected)
-    times = table.numbers(expected, [0])[:, 0]
-    check_increasing(f"{path}, line", table.lines, times)
-    return times
 
 
 def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
@@ -77,17 +68,13 @@ def _camera_truth(path: Path, times: Times, P: Float[np.ndarray, "3 4"] | None) 
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
     row = "12 finite numbers, the rows of a 3x4 T_wc"
     rows = read_table(path, "poses", "poses", row).numbers(row, range(12)).reshape(-1, 3, 4)
-    _check_count(path, len(rows), len(times))
+    if len(rows) != len(times):
+        raise ValueError(f"{path} has {len(rows)} lines for {len(times)} times")
     T_wc = transforms(rows[:, :, :3], rows[:, :, 3])
     check_rigid(path, T_wc)
     if P is not None:
         T_wc[:, :3, 3] -= rows[:, :, :3] @ np.linalg.solve(P[:, :3], P[:, 3])
     return Trajectory(times, T_wc)
-
-
-def _check_count(path: Path, found: int, images: int) -> None:
-    if found != images:
-        raise ValueError(f"{path} has {found} lines for {images} images")
 
 
 KITTI = Layout(

@@ -5,6 +5,7 @@ import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from jaxslam.io.calibration import (
     GUESSED_FIELD_OF_VIEW,
@@ -16,7 +17,7 @@ from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
 from jaxslam.io.kitti import KITTI
 from jaxslam.io.lens_files import read_calibration
-from jaxslam.io.recording import PLAIN, TIMESTAMPED, Recording
+from jaxslam.io.recording import PLAIN, TIMESTAMPED, Recording, image_files
 from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
 from jaxslam.io.source import Source, Trajectory, check_size, resized, selected
@@ -61,10 +62,8 @@ def open_source(
     height, width = image.shape
     camera = _calibration(recording, width, height, calibration, fov)
     check_size(f"{recording.name}: image 0", image, camera)
-    source = Source(
-        recording.name, camera, recording.times, recording.images, recording.reference,
-        recording.clock, inertial=recording.inertial,
-    )  # fmt: skip
+    held: Any = vars(recording) | {"calibration": camera}
+    source = Source(**held)
     if reference is not None:
         source = replace(source, reference=Trajectory(*read_tum(reference)))
     if scale is None:
@@ -91,7 +90,9 @@ def _found(path: Path) -> str:
     if not path.is_dir():
         return f"a file {path.suffix or 'without a suffix'}"
     names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]
-    return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}"
+    inner = [x.name for x in sorted(path.iterdir()) if x.is_dir() and image_files(x)]
+    hint = f" (pictures are in {', '.join(inner[:5])}: give one of these)" if inner else ""
+    return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}{hint}"
 
 
 def _scale_for(name: str, width: int, height: int) -> float:
@@ -108,9 +109,7 @@ def _scale_for(name: str, width: int, height: int) -> float:
 
 def _of_pictures(name: str, camera: Calibration, width: int, height: int) -> Calibration:
     """A calibration at the size of the pictures, where theirs is the same shape."""
-    if (camera.width, camera.height) == (width, height) or (
-        camera.width * height != camera.height * width
-    ):
+    if camera.width == width or camera.width * height != camera.height * width:
         return camera
     warnings.warn(
         f"{name} is for {camera.width}x{camera.height}: it is taken to be of the same pictures "
@@ -125,11 +124,12 @@ def _calibration(
 ) -> Calibration:
     """The user's, or the layout's, or a guess."""
     if file:
-        return _of_pictures(str(file), read_calibration(file), width, height)
+        return _of_pictures(str(file), read_calibration(file, (width, height)), width, height)
     if fov is not None:
         return from_field_of_view(width, height, fov)
     if recording.calibration is not None:
-        return recording.calibration(width, height)
+        own = recording.calibration(width, height)
+        return _of_pictures(f"{recording.name}: its calibration", own, width, height)
     warnings.warn(
         f"{recording.name} has no calibration: a horizontal field of view of "
         f"{GUESSED_FIELD_OF_VIEW:g}° is guessed, and the lens estimated. Better: give a "

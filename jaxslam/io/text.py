@@ -21,7 +21,7 @@ from jaxslam._runtime.files import LARGEST
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
-_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
+DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
 """A date and time of ISO 8601, which is a cell, in whatever columns."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
@@ -104,7 +104,7 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
 def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
     """The same of the lines of a file."""
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
-    lines = {n: _DATE.sub(r"\1T\2", line) for n, line in told.items() if not _is_comment(line)}
+    lines = {n: DATE.sub(r"\1T\2", line) for n, line in told.items() if not _is_comment(line)}
     named = []
     while lines and not any(_number(cell) is not None for cell in cells(lines[min(lines)])):
         named.append(lines.pop(min(lines)))
@@ -206,7 +206,7 @@ def rows_of(
 def numbers_of(told: object) -> list[float]:
     """The numbers of a word, or of a list of any depth; none of anything else."""
     if isinstance(told, str):
-        words = told.strip("[]").replace(",", " ").split()
+        words = re.sub(r"[][,]", " ", told).split()
         return numbers(words, len(words)) or []
     try:
         return np.asarray(told, float).ravel().tolist() if told is not None else []
@@ -217,7 +217,7 @@ def numbers_of(told: object) -> list[float]:
 def _number(cell: str) -> float | None:
     """A number, or the seconds from 1970 to a date, of UTC where it says no zone."""
     try:
-        if not _DATE.match(cell):
+        if not DATE.match(cell):
             return float(cell)
         date = datetime.fromisoformat(cell)
         return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()

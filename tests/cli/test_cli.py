@@ -9,11 +9,12 @@ import sys
 import threading
 
 import pytest
-from refusals import ended
+from refusals import ended, refused
 
 import jaxslam
 from jaxslam.cli import main
 from jaxslam.cli.evaluate import RIVALS
+from jaxslam.cli.extra import seconds
 from jaxslam.consistency import BACKENDS, DTYPES
 from jaxslam.consistency.montecarlo import Interruption
 from jaxslam.consistency.suite import SUITE
@@ -268,3 +269,23 @@ def test_help_names_what_is_accepted(command, accepted, capsys):
     assert stop.value.code == 0
     told = capsys.readouterr().out
     assert not [name for name in accepted if name not in told]
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        ("20ms", 0.02),
+        ("0.02 s", 0.02),
+        ("50us", 5e-5),
+        ("7µs", 7e-6),
+        ("-3.5e-2", -0.035),
+        (".5", 0.5),
+    ],
+)
+def test_a_time_may_have_a_unit(told, expected):
+    assert seconds("--readout", told) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("told", ["soon", "", "20 min", "nan", "inf", "1e999", "--3"])
+def test_what_is_no_time_is_refused_by_its_option(told):
+    refused(seconds, "^--readout is a time such as 20ms or 0.02s, not '", "--readout", told)

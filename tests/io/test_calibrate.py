@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from pictures import jpeg
 from refusals import ended
 from scipy.spatial.transform import Rotation
 
@@ -75,6 +76,19 @@ def test_the_camera_is_found_within_three_of_its_own_sigma(calibrated):
         assert abs(value) < 3 * sigma
     assert 0 < calibrated.rms < 0.3
     assert len(calibrated.views) >= 10
+
+
+@pytest.mark.parametrize("filmed", BOARDS[1:], indirect=True, ids=["charuco"])
+def test_photographs_that_are_turned_differently_are_of_one_sensor(filmed, calibrated, tmp_path):
+    board, path = filmed
+    for index, file in enumerate(sorted(path.iterdir())):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        (tmp_path / f"{file.stem}.jpg").write_bytes(jpeg(image, (1, 3, 6)[index % 3]))
+    with pytest.warns(UserWarning, match="all are taken as the sensor saw them"):
+        found = calibrate(tmp_path, board).calibration
+    assert (found.width, found.height) == (CAMERA.width, CAMERA.height)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(found, name) == pytest.approx(getattr(calibrated.calibration, name), abs=0.5)
 
 
 def test_blurred_pictures_are_left_out(filmed, calibrated):

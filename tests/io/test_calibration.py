@@ -175,6 +175,120 @@ def test_the_lenses_of_other_programs_are_read(tmp_path, name, old, new, lens):
     assert read_calibration(tmp_path / "own.json") == lens
 
 
+NAMED = "fx: 525.0\nfy: 524.0\ncx: 308.5\ncy: 236.5\n"
+BENT = "k1: 0.1\nk2: -0.2\np1: 0.01\np2: 0.02\n"
+OF_FOUR = "k1: 0.1\nk2: -0.2\nk3: 0.01\nk4: 0.02\n"
+SIZE = "Camera.width: 640\nCamera.height: 480\n"
+NUMBERS = {"fx": 525.0, "fy": 524.0, "cx": 308.5, "cy": 236.5}
+WIDTH_HEIGHT = {"width": 640, "height": 480}
+FOUR_NUMBERS = [0.1, -0.2, 0.01, 0.02]
+ROWS = [[525.0, 0, 308.5], [0, 524.0, 236.5], [0, 0, 1]]
+COLUMNS = [list(column) for column in zip(*ROWS, strict=True)]
+
+
+def below(name, *lines, indent="  "):
+    """Lines of YAML below a key, or with the key before each of them."""
+    if name.endswith("."):
+        return "".join(name + line + "\n" for text in lines for line in text.splitlines())
+    return f"{name}:\n" + "".join(indent + x + "\n" for text in lines for x in text.splitlines())
+
+
+def block(numbers):
+    return "".join(f"- {x}\n" for x in np.ravel(numbers).tolist())
+
+
+VINS = "image_width: 640\nimage_height: 480\n"
+KANNALA = "k2: 0.1\nk3: -0.2\nk4: 0.01\nk5: 0.02\nmu: 525.0\nmv: 524.0\nu0: 308.5\nv0: 236.5\n"
+ROS_2 = f"height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd:\n{block(FOUR_NUMBERS)}k:\n"
+WHOLE = "height: 960\nwidth: 1280\nD: [0.1, -0.2, 0.01, 0.02]\n"
+SVO = below("distortion", "parameters:\n  data: [0.1, -0.2, 0.01, 0.02]", "type: TYPE")
+SVO += f"image_height: 480\nimage_width: 640\nintrinsics:\n  data: {list(NUMBERS.values())}\n"
+XML = """<?xml version="1.0"?><opencv_storage><image_width>640</image_width>
+<image_height>480</image_height><camera_matrix type_id="opencv-matrix"><rows>3</rows><data>
+525. 0. 308.5 0. 524.
+236.5 0. 0. 1.</data></camera_matrix><distortion_coefficients><data>0.1 -0.2 0.01 0.02 0.</data>
+</distortion_coefficients></opencv_storage>"""
+BASALT = {"camera_type": "kb4", "intrinsics": NUMBERS | dict(k1=0.1, k2=-0.2, k3=0.01, k4=0.02)}
+NERF = {"fl_x": 525.0, "fl_y": 524.0, "cx": 309.0, "cy": 237.0, "w": 640, "h": 480, "k1": 0.1}
+REALSENSE = WIDTH_HEIGHT | {"fx": 525.0, "fy": 524.0, "ppx": 308.5, "ppy": 236.5}
+GYROFLOW = {"calib_dimension": {"w": 640, "h": 480}}
+GYROFLOW["fisheye_params"] = {"camera_matrix": ROWS, "distortion_coeffs": FOUR_NUMBERS}
+UNBENT, ONE = replace(LENS, distortion=()), replace(LENS, distortion=(0.1,))
+
+
+@pytest.mark.parametrize(
+    ("text", "lens"),
+    [
+        ("%YAML:1.0\n" + below("Camera1.", NAMED, BENT) + SIZE + "Camera.newWidth: 600\n", LENS),
+        ('Camera.type: "Rectified"\n' + below("Camera1.", NAMED) + SIZE, UNBENT),
+        (
+            'Camera.type: "KannalaBrandt8"\n' + below("Camera1.", NAMED, OF_FOUR)
+            + below("Camera2.", "fx: 1\nfy: 1\ncx: 1\ncy: 1\nk1: 1") + SIZE,
+            FISHEYE,
+        ),
+        (below("Camera", "model: perspective\ncols: 640\nrows: 480", NAMED, BENT)
+         + below("StereoRectifier", "model: fisheye"), LENS),
+        (below("Camera", "model: fisheye\ncols: 640\nrows: 480", NAMED, OF_FOUR), FISHEYE),
+        (VINS + "model_type: PINHOLE\n" + below("distortion_parameters", BENT)
+         + below("projection_parameters", NAMED) + "min_dist: 30\n", LENS),
+        (VINS + "model_type: KANNALA_BRANDT\n" + below("projection_parameters", KANNALA), FISHEYE),
+        (ROS_2 + block(ROWS) + "binning_x: 0\nroi:\n  x_offset: 0\n  width: 0\n", LENS),
+        (f"{WHOLE}K: [1050, 0, 617.5, 0, 1048, 473.5, 0, 0, 1]\nbinning_x: 2\nbinning_y: 2", LENS),
+        (WHOLE + "K: [525, 0, 408.5, 0, 524, 286.5, 0, 0, 1]\n"
+         + below("roi", "x_offset: 100\ny_offset: 50\nheight: 480\nwidth: 640"), LENS),
+        (f"cameras:\n- camera:\n{below('x', SVO)}".replace("TYPE", "radial-tangential"), LENS),
+        (f"cameras:\n- camera:\n{below('x', SVO)}".replace("TYPE", "equidistant"), FISHEYE),
+        (f"width: 640\nheight: 480\nK: [[525., 0, 308.5],\n  [0, 524., 236.5], [0, 0, 1]]\n"
+         f"dist: [{FOUR_NUMBERS}]\n", LENS),
+        (f"{VINS}camera_matrix: {{rows: 3, cols: 3, data: {np.ravel(ROWS).tolist()}}}\n"
+         f"Distortion_Coefficients: {{rows: 1, data: {FOUR_NUMBERS}}}\n", LENS),
+        (XML, LENS),
+        (NUMBERS | WIDTH_HEIGHT | dict(k1=0.1, k2=-0.2, p1=0.01, p2=0.02), LENS),
+        (GOOD | {"distortion": None, "k1": 0.1}, ONE),
+        (REALSENSE | {"model": "distortion.brown_conrady", "coeffs": FOUR_NUMBERS}, LENS),
+        (REALSENSE | {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}, UNBENT),
+        (WIDTH_HEIGHT | {"intrinsic_matrix": np.ravel(COLUMNS).tolist()}, UNBENT),
+        (WIDTH_HEIGHT | {"K": COLUMNS}, UNBENT),
+        (NERF | {"camera_model": "OPENCV", "k2": -0.2, "p1": 0.01, "p2": 0.02}, LENS),
+        (NERF | {"is_fisheye": True, "k2": -0.2, "k3": 0.01, "k4": 0.02}, FISHEYE),
+        ({"value0": {"intrinsics": [BASALT, {}], "resolution": [[640, 480], [1, 1]]}}, FISHEYE),
+        (GYROFLOW, FISHEYE),
+        ("# two\n1 PINHOLE 3072 2304 9 9 9 9\n2 " + COLMAP, LENS),
+    ],
+)  # fmt: skip
+def test_the_keys_of_other_programs_are_read_wherever_they_are(tmp_path, text, lens):
+    path = tmp_path / "lens"
+    path.write_text(text if isinstance(text, str) else json.dumps(text))
+    assert read_calibration(path, (640, 480)) == lens
+
+
+@pytest.mark.parametrize(
+    ("text", "lens"),
+    [
+        (below("Camera.", NAMED, BENT), LENS),
+        (json.dumps(NUMBERS), UNBENT),
+        ("525 0 308.5\n0 524 236.5\n0 0 1\n", UNBENT),
+        ("525 0 308.5 0\n0 524 236.5 0\n0 0 1 0\n0 0 0 1\n", UNBENT),
+        ("525.0 524.0 308.5 236.5\n", UNBENT),
+        ("P0: 525 0 308.5 0 0 524 236.5 0 0 0 1 0\nP1: 1 0 2 -9 0 1 2 0 0 0 1 0\n", UNBENT),
+    ],
+)
+def test_a_file_without_a_size_is_of_the_pictures_with_a_warning(tmp_path, text, lens):
+    path = tmp_path / "lens"
+    path.write_text(text)
+    with pytest.warns(UserWarning, match="lens states no image size: .* they are, 640x480"):
+        assert read_calibration(path, (640, 480)) == lens
+    refused(read_calibration, "lens: states no image size; add width and height", path)
+
+
+def test_the_first_of_several_cameras_of_a_size_is_taken_with_a_warning(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"1 {COLMAP}\n2 {COLMAP.replace('525', '600')}\n3 PINHOLE 9 9 9 9 9 9\n")
+    for size, words in (((640, 480), "the first of this size"), (None, "the first is taken")):
+        with pytest.warns(UserWarning, match=f"cameras.txt has 3 cameras, of which {words}"):
+            assert read_calibration(path, size) == LENS
+
+
 def own(**changes):
     fields = {key: value for key, value in (GOOD | changes).items() if value is not None}
     return "own.json", json.dumps(fields)
@@ -204,10 +318,41 @@ def other(name, old, new):
         (("own.json", "{"), "not a JSON file"),
         (("own.json", "[1]"), "expected a JSON object, not a list"),
         (("own.json", None), "cannot read"),
-        (other("camchain.yaml", "pinhole", "omni"), "unknown lens, omni radtan of 4 numbers; exp"),
+        (other("camchain.yaml", "pinhole", "omni"), "unknown lens, omni radtan; exp"),
         (other("ros.yaml", "0.02, 0]", "0.02, 0, 0, 0, 0, 0.3]"), "of 9 numbers; expected plumb"),
-        (other("ros.yaml", "image_width: 640\n", ""), "has no image size or no camera matrix; i"),
+        (other("ros.yaml", "image_width: 640\n", ""), "states no image size; add width"),
         (other("cameras.txt", "OPENCV", "FOV"), "unknown camera model FOV of 10"),
+        (
+            ("k.json", json.dumps(GOOD | {"distortion": [], "lens_distortion": [0.1]})),
+            "its lens_distortion is not read; name it distortion",
+        ),
+        (
+            ("k.json", json.dumps(WIDTH_HEIGHT | {"K": [[525.0, 3.0, 308.5], *ROWS[1:]]})),
+            r"its matrix \[\[525.0, 3.0, 308.5\], .* is not \[fx 0 cx; 0 fy cy; 0 0 1\]",
+        ),
+        (own(fx=0.82, fy=1.1), "fx is 0.82; focal lengths and centre are in pixels"),
+        (
+            ("vins.yaml", "model_type: MEI\nmirror_parameters:\n  xi: 1.9\n"),
+            "unknown lens, MEI; expe",
+        ),
+        (
+            ("svo.yaml", SVO.replace("TYPE", "fisheye").replace("0.1, -0.2, 0.01, 0.02", "0.93")),
+            "unknown lens, fisheye of 1 numbers; expected",
+        ),
+        (
+            (
+                "rs.json",
+                json.dumps(REALSENSE | {"model": "inverse_brown_conrady", "coeffs": [0.1]}),
+            ),
+            "unknown lens, inverse_brown_conrady of 1 numbers",
+        ),
+        (
+            ("agisoft.xml", "<c><width>640</width><f>525</f><cx>-11</cx><k1>0.1</k1></c>"),
+            "no camera matrix of finite .*, and no fx, fy, cx, cy; its keys are width, f, cx, k1",
+        ),
+        (("broken.yaml", "width: [1, 2\nK: 3\n"), "broken.yaml: not a YAML file"),
+        (("broken.xml", "<c><width>640</c>"), "mismatched tag"),
+        (("ost.txt", "# oST\n[image]\nwidth\n640\n"), "no camera matrix of finite numbers"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -78,15 +78,55 @@ def mosaic(pattern):
         ("bgra8", colour("bgra"), 0),
         *[(f"bayer_{x}8", mosaic(x), 0) for x in ("rggb", "bggr", "gbrg", "grbg")],
         ("bayer_rggb16", mosaic("rggb") * np.uint16(256), 0),
+        ("16UC1", np.full(SIZE, 256 * LUMA + 77, "<u2"), 0),
+        ("8UC4", colour("bgra"), 0),
+        *[(x, np.tile(np.array([128, LUMA], np.uint8), SIZE), 0) for x in ("yuv422", "uyvy")],
+        *[(x, np.tile(np.array([LUMA, 128], np.uint8), SIZE), 0) for x in ("yuv422_yuy2", "yuyv")],
+        ("nv12", np.full(SIZE, LUMA, np.uint8), 0),
     ],
 )
 def test_every_encoding_is_made_grey(encoding, data, big, tmp_path):
     for name, spare in (("run.bag", 0), ("run.mcap", 6)):
         step = data.nbytes // HEIGHT + spare
-        told = [ros_of(name).image(STAMPS[0], data, encoding, step=step, big=big)]
+        told = [ros_of(name).image(STAMPS[0], data, encoding, step=step, big=big, width=WIDTH)]
         (frame,) = open_source(write_bag(tmp_path / name, {TOPIC: told}), fov=60)
         assert (frame.image.shape, frame.image.dtype) == (SIZE, np.uint8)
         np.testing.assert_allclose(frame.image, LUMA, rtol=0, atol=1)
+
+
+def test_a_mosaic_that_is_compressed_is_made_grey(tmp_path):
+    r, data = ros_of("run.bag"), cv2.imencode(".png", mosaic("rggb"))[1]
+    for form, grey in (("bayer_rggb8; png compressed ", LUMA), ("mono8; png compressed ", 200)):
+        told = {f"{TOPIC}/compressed": [r.compressed(STAMPS[0], data, form)]}
+        (frame,) = open_source(write_bag(tmp_path / f"{form[:4]}.bag", told), fov=60)
+        assert abs(int(frame.image[0, 0]) - grey) <= 1
+
+
+def test_a_thermal_topic_is_stretched_once_for_all(tmp_path):
+    r, ramp = ros_of("run.mcap"), np.linspace(0, 300, WIDTH * HEIGHT).reshape(SIZE)
+    levels = [(7000 + 200 * i + ramp).astype("<u2") for i in range(4)]
+    told = {TOPIC: [r.image(t, x, "mono16") for t, x in zip(STAMPS, levels, strict=True)]}
+    with pytest.warns(UserWarning, match="image_raw: pictures have more than 8 bits, of which 29"):
+        frames = list(open_source(write_bag(tmp_path / "run.mcap", told), fov=60))
+    for frame in frames:
+        assert np.abs(frame.image.ravel() - np.linspace(0, 255, ramp.size)).max() < 3
+
+
+@pytest.mark.parametrize(
+    ("size", "part", "expected"),
+    [
+        ((200, 300), (10, 20, WIDTH, HEIGHT, 1, 1), (60.0, 61.0, 21.0, 3.0)),
+        ((200, 300), (10, 3, 2 * WIDTH, 2 * HEIGHT, 2, 2), (30.0, 30.5, 10.25, 9.75)),
+        ((2 * HEIGHT, 2 * WIDTH), (0, 0, 0, 0, 2, 2), (30.0, 30.5, 15.25, 11.25)),
+        (SIZE, (0, 0, WIDTH, HEIGHT, 0, 0), (60.0, 61.0, 31.0, 23.0)),
+    ],
+)
+def test_a_part_of_the_sensor_has_its_own_centre(tmp_path, size, part, expected):
+    for name in ("run.bag", "run.mcap"):
+        r = ros_of(name)
+        told = {"/camera/camera_info": info(r, size=size, part=part)}
+        found = open_source(film(tmp_path / name, **told)).calibration
+        assert (found.fx, found.fy, found.cx, found.cy) == expected
 
 
 def test_compressed_and_rectified_pictures_have_the_lens_of_their_camera(tmp_path):
@@ -111,10 +151,14 @@ def test_without_a_lens_it_is_guessed(tmp_path):
         ("none.mcap", {}),
         ("zero.mcap", {"/camera/camera_info": zero}),
         ("other.mcap", {"/left/camera_info": info(r)}),
+        ("rect.mcap", {"/camera/camera_info": info(r)}),  # whose P is zero
     ):
-        bag = write_bag(tmp_path / name, {TOPIC: pictures(r)} | beside)
-        with pytest.warns(UserWarning, match=f"{name}:{TOPIC} has no calibration"):
+        topic = "/camera/image_rect" if name == "rect.mcap" else TOPIC
+        bag = write_bag(tmp_path / name, {topic: pictures(r)} | beside)
+        with pytest.warns(UserWarning, match=f"{name}:{topic} has no calibration"):
             assert open_source(bag).calibration.guessed
+    bag = write_bag(tmp_path / "bare.mcap", {"image_raw": pictures(r), "camera_info": info(r)})
+    assert open_source(bag).calibration.fx == 60
 
 
 refused = partial(refusals.refused, lambda *given, **more: list(open_source(*given, **more)))
@@ -152,7 +196,7 @@ def compressed(count):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        (one(np.zeros(SIZE, np.uint16), "16UC1"), "message 0: unknown encoding '16UC1'; known: mo"),
+        (one(np.zeros(SIZE, "f4"), "32FC1"), "message 0: unknown encoding '32FC1'; known: mo"),
         (one(picture(0), "bgr8", width=WIDTH),
          "message 0: 3072 bytes in rows of 64 are not a complete 64x48 picture in bgr8"),
         (one(picture(0)[:, :0], "mono8"), "0 bytes in rows of 0 are not a complete 0x48 picture"),

@@ -32,6 +32,22 @@ def test_a_video_file_has_its_pictures_at_their_times(filmed, calibration):
     np.testing.assert_allclose(brightness(source), [5, 35, 65, 95, 125, 155], atol=4)
 
 
+def test_a_thermal_video_of_sixteen_bits_is_stretched_once_for_all(tmp_path, calibration):
+    path, size = tmp_path / "thermal.mkv", (WIDTH, HEIGHT)
+    how = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    codec = cv2.VideoWriter.fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, RATE, size, how)
+    ramp = np.linspace(0, 300, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    for index in range(3):
+        writer.write((7000 + 100 * index + ramp).astype(np.uint16))
+    writer.release()
+    with pytest.warns(UserWarning, match=r"thermal\.mkv: pictures have more than 8 bits, of which"):
+        frames = [frame.image for frame in open_source(path, calibration=calibration)]
+    assert len(frames) == 3
+    for image in frames:
+        assert np.abs(image.ravel() - np.linspace(0, 255, ramp.size)).max() < 3
+
+
 class Told:
     """A capture that delivers these times and pictures."""
 
