@@ -26,9 +26,9 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from jaxslam._runtime import __version__
 from jaxslam._runtime.files import Json
 from jaxslam._runtime.lookup import lookup
+from jaxslam._version import __version__
 from jaxslam.filters.slam import Slam
 from jaxslam.geometry import PLANAR, Scalar
 from jaxslam.landmarks import LANDMARKS
