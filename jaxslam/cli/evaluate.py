@@ -18,6 +18,7 @@ from jaxslam.evaluation import CHOICES, Convention, Evaluation, evaluate_poses
 from jaxslam.evaluation.inputs import read_pose_log
 from jaxslam.evaluation.log_files import evaluate_log, named
 from jaxslam.evaluation.result import latex
+from jaxslam.io.text import numbers
 
 RIVALS = ("recommended", "robocentric", "invariant", "world")
 _OF_ONE_LOG = (
@@ -141,8 +142,8 @@ class EvaluateOptions:
             raise ValueError(f"{self.source} has no log: expected {expected}")
         suite, told = read_suite(folder, paths, self.seed), {}
         found = {name: self._of_log(paths[name], one) for name, one in suite.items()}
-        for name, (yours, numbers) in found.items():
-            told[name] = {"yours": numbers, **self._of_filters(name, suite[name])}
+        for name, (yours, content) in found.items():
+            told[name] = {"yours": content, **self._of_filters(name, suite[name])}
             lines = _comparison(f"{name}, {suite[name].runs} runs", told[name])
             doubt = [yours.identified.sentence] if yours.identified and yours.suggested else []
             print(*lines, f"yours: {yours.headline}", *doubt, "", sep="\n")
@@ -177,13 +178,10 @@ class EvaluateOptions:
 
 
 def _seconds(told: str) -> float | str:
-    try:
-        offset = 0.0 if told == "auto" else float(told)
-    except ValueError:
-        offset = np.nan
-    if not np.isfinite(offset):
+    offset = numbers([told], 1)
+    if offset is None and told != "auto":
         raise ValueError(f"--time-offset must be seconds, or auto, not {told}")
-    return "auto" if told == "auto" else offset
+    return offset[0] if offset else told
 
 
 def _comparison(title: str, filters: dict[str, Json]) -> list[str]:
