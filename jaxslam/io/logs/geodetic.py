@@ -22,9 +22,8 @@ EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 GPS_EPOCH = 315964800.0
 """Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
 WEEK = 604800.0
-SAID = {"error": "split", "axes": "body"}
-_TIMES = "times are those of GPS"
-NOTE = f"x, y, z are east, north and up; {_TIMES}"
+SAID, ENU = {"error": "split", "axes": "body"}, "east, north and up"
+NOTE = "x, y, z are {}; times are those of GPS"
 _RTKLIB = {
     "latitude(deg) longitude(deg) height(m)": "sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)",
     "x-ecef(m) y-ecef(m) z-ecef(m)": "sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)",
@@ -59,8 +58,8 @@ def read_rtklib(table: Table) -> Log | None:
     P = symmetric(np.sign(roots) * roots**2, [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)])
     if geodetic:
         return _log(times, *np.radians(p[:, :2]).T, p[:, 2], P)
-    world = "ECEF" if places.startswith("x") else "east, north, up"
-    T, note = transforms(np.tile(np.eye(3), (len(p), 1, 1)), p), f"x, y, z are {world}; {_TIMES}"
+    world = "ECEF" if places.startswith("x") else ENU
+    T, note = transforms(np.tile(np.eye(3), (len(p), 1, 1)), p), NOTE.format(world)
     return Log(times, T, P, SAID | {"axes": "world"}, (note,), oriented=False, world=world)
 
 
@@ -95,4 +94,4 @@ def _log(times: Times, north: Times, east: Times, height: Times, P: np.ndarray) 
     along = (radius + height) * cn
     p = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
     T = transforms(np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0)), p)
-    return Log(times, T, P, SAID, (NOTE,), oriented=False, world="ECEF")
+    return Log(times, T, P, SAID, (NOTE.format(ENU),), oriented=False, world="ECEF")

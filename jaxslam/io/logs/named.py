@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.io.logs.log import (
     MIXED,
     NOTHING,
@@ -153,7 +154,8 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
         if flat and max(place) < 5:  # of x, y and yaw
             place = [5 if x > 1 else x for x in place]
         unit = _radians(table.titles[i]) if len(names) == 1 else 1.0
-        cells[place[0], place[-1]] = (table.rows[:, i] * unit) ** (2 if found["sigma"] else 1)
+        column = unit * np.clip(table.rows[:, i], -LARGEST, LARGEST)  # whose square is finite
+        cells[place[0], place[-1]] = column ** (2 if found["sigma"] else 1)
         if {"roll", "pitch"} & {*names}:
             axes = {"error": "split", "axes": "rpy"}
         axes = _ROS if found["cov"] and not names else axes

@@ -115,7 +115,7 @@ def _as_titled(table: Table) -> Log | None:
     """Lines of these numbers, and maybe of frames, by their titles."""
     rows = np.delete(table.rows, [*table.words], axis=1)
     titles = tuple(_STAMPED.get(rows.shape[1], "").split())
-    whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.linalg.norm(rows[:, 3:7], axis=1)
+    whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.hypot.reduce(rows[:, 3:7], axis=1)
     # No whole seconds and nanoseconds; or a quaternion, without a time.
     if (np.abs(turn - 1) < _LENGTH).all() if len(titles) == 7 else not whole.all():
         return None
