@@ -382,7 +382,30 @@ ENU_P = ENU_CORRELATION * np.outer(ENU_SIGMA, ENU_SIGMA)
 ENU_ERRORS = RNG.normal(size=(STEPS, 3)) @ np.linalg.cholesky(ENU_P).T
 
 
-def on_earth(folder):
+def rtklib(folder, name, titles, numbers, spread):
+    """A solution of RTKLIB with dates of UTC, between commas."""
+    dates = [datetime.fromtimestamp(1.6e9 + i, UTC) for i in range(STEPS)]
+    zero = np.zeros((STEPS, 2))
+    rows = np.column_stack([numbers, zero, np.tile(spread, (STEPS, 1)), zero])
+    told = [f"{x:%Y/%m/%d %H:%M:%S.000},{','.join(map(repr, row))}" for x, row in
+            zip(dates, rows.tolist(), strict=True)]  # fmt: skip
+    (folder / name).write_text("\n".join([f"%  UTC,{titles},Q,ns,age(s),ratio", *told]) + "\n")
+
+
+def from_base(titles):
+    """RTKLIB's positions along such axes, and their truth."""
+
+    def write(folder):
+        truth = np.column_stack([np.linspace(0, 50, STEPS), *np.full((2, STEPS), 5e6)])
+        places = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)]
+        roots = [np.sign(ENU_P[x]) * np.sqrt(abs(ENU_P[x])) for x in places]
+        rtklib(folder, "estimate.pos", titles, truth - ENU_ERRORS, roots)
+        rtklib(folder, "truth.pos", titles, truth, roots)
+
+    return write
+
+
+def on_earth(folder, utc=False):
     """RTKLIB's solution at 22° south, and NovAtel's truth in degrees, minutes and seconds."""
     seconds = 455342.0 + np.arange(STEPS)
     zero = np.zeros(STEPS)
@@ -400,17 +423,43 @@ def on_earth(folder):
     roots = [np.sign(ENU_P[x]) * np.sqrt(abs(ENU_P[x])) + zero for x in order]
     titles = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m)"
     week = zero + 2158
-    lines(
-        folder / "estimate.pos",
-        *(week, seconds, *own, zero, zero, *roots),
-        header=f"% program : RTKPOST\n% GPST {titles} sdun(m)\n",
-    )
+    if utc:
+        week, seconds = zero + 2123, 1.6e9 + 18 - 315964800 - 2123 * 604800 + np.arange(STEPS)
+        told = titles.partition(" Q")[0].replace(" ", ",")
+        rtklib(folder, "estimate.pos", told, np.column_stack(own), [x[0] for x in roots])
+    else:
+        lines(
+            folder / "estimate.pos",
+            *(week, seconds, *own, zero, zero, *roots),
+            header=f"% program : RTKPOST\n% GPST {titles} sdun(m)\n",
+        )
     parts = []
     for angle in (latitude, longitude):
         whole, minutes = np.trunc(angle), 60 * np.abs(angle - np.trunc(angle))
         parts += [whole, np.trunc(minutes), 60 * (minutes - np.trunc(minutes))]
     titles = "UTCTime Week GPSTime Latitude Longitude H-Ell\n"
     lines(folder / "truth.txt", seconds, week, seconds, *parts, height, header=titles)
+
+
+def echoed(folder):
+    """What `ros2 topic echo --csv` prints of poses with covariances."""
+    write_tum(folder / "truth.txt", TIMES, TRUTH)
+    stamps = zip(TIMES // 1, np.round(1e9 * (TIMES % 1)), strict=True)
+    numbers = np.hstack([ESTIMATE[:, :3, 3], quaternions(R), in_the_world(P).reshape(-1, 36)])
+    rows = [
+        f"{s:.0f},{ns:.0f},map,{','.join(map(repr, row))}"
+        for (s, ns), row in zip(stamps, numbers.tolist(), strict=True)
+    ]
+    (folder / "estimate.csv").write_text("\n".join(rows) + "\n")
+
+
+def nclt(folder):
+    """Microseconds, positions, and roll, pitch and yaw."""
+    tum(folder)
+    for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
+        (folder / f"{name}.txt").unlink()
+        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")
+        lines(folder / f"{name}.csv", np.round(1e6 * TIMES), T[:, :3, 3], angles, between=",")
 
 
 def graph(folder):
@@ -538,6 +587,8 @@ ONE_RUN = "step,a,b,c,d,aa,ab,ac,ad,bb,bc,bd,cc,cd,dd\n"
 NEES = RNG.chisquare(4, RUNS)
 NEES_ALONE = NEES.reshape(-1, 1), np.full(NEES.size, 4)
 OF_DEVIATIONS = partial(jaxslam.evaluate, ERRORS, of_sigmas(DEVIATIONS))
+OF_ENU = partial(jaxslam.evaluate, ENU_ERRORS[None], np.tile(ENU_P, (1, STEPS, 1, 1)), names="xyz")
+OF_ONE = partial(jaxslam.evaluate, ERRORS[:1], COVARIANCES[:1])
 NEES_OF, NIS_OF = (partial(evaluate_nees, NEES, 4, quantity=x) for x in ("NEES", "NIS"))
 MARGINALS: dict[str, Any] = {
     "estimates": ESTIMATE[None], "covariances": right_rotation_first(P)[None],
@@ -634,12 +685,27 @@ LOGS = {
         rtol=0.02, convention=Convention("right"),
     ),
     "SQUARE": Log(square, rtol=0.02, convention=Convention("right", order="rotation-first")),
-    "RTKLIB and NovAtel": Log(
-        on_earth,
-        partial(jaxslam.evaluate, ENU_ERRORS[None], np.tile(ENU_P, (1, STEPS, 1, 1)), names="xyz"),
-        convention=Convention("split", "body"),
-    ),
+    "RTKLIB and NovAtel": Log(on_earth, OF_ENU, convention=Convention("split", "body")),
+    "RTKLIB in UTC and NovAtel": Log(lambda x: on_earth(x, utc=True), OF_ENU, rtol=2e-3,
+                                     convention=Convention("split", "body"), spare=True),
+    "RTKLIB, ECEF": Log(from_base(
+        "x-ecef(m),y-ecef(m),z-ecef(m)"), OF_ENU, convention=SPLIT, spare=True),
+    "RTKLIB, from its base": Log(from_base(
+        "e-baseline(m),n-baseline(m),u-baseline(m)"), OF_ENU, convention=SPLIT, spare=True),
     "g2o": Log(graph),
+    "NCLT": Log(nclt),
+    "TUM, names of rpg_trajectory_evaluation": Log(
+        lambda x: tum(x, "stamped_traj_estimate.txt", truth="stamped_groundtruth.txt")),
+    "TUM, seconds and nanoseconds": Log(rewritten(
+        lambda _, row: " ".join([*row[0].split("."), *row[1:]]) if len(row) == 8 else " ".join(row)
+    )),
+    "echo of ROS 2": Log(echoed, convention=SPLIT),
+    "titles of PX4": Log(titled(
+        "timestamp timestamp_sample position[0] position[1] position[2] q[0] q[1] q[2] q[3] "
+        + " ".join(f"{x}_variance[{i}]" for x in ("position", "orientation") for i in range(3)),
+        1e6 * (TIMES + 0.2), 1e6 * TIMES, ESTIMATE[:, :3, 3], np.roll(quaternions(R), 1, axis=1),
+        SIGMA**2,
+    ), OF_SIGMAS),
     "TUM, column by column": Log(tum_and(P[:, *np.tril_indices(6)])),
     "runs beside one truth": Log(two_beside_one_truth, partial(
         evaluate_poses, *(np.array(x) for x in ([ESTIMATE, OTHER], [P, P], [TRUTH, TRUTH])),
@@ -661,6 +727,17 @@ LOGS = {
     ),
     "mat of NEES": Log(mat(nees=NEES, dof=4), NEES_OF, "runs.mat"),
     "npz of errors": npz_log(OF_ERRORS, errors=ERRORS, covariances=COVARIANCES),
+    "npz of one run": npz_log(OF_ONE, errors=ERRORS[0], covariances=COVARIANCES[0]),
+    "npz of one run of NEES": npz_log(
+        partial(evaluate_nees, NEES[:1], 4), nees=NEES[0], dof=np.full(5, 4)),
+    "npz of one run of σ": npz_log(
+        partial(jaxslam.evaluate, ERRORS[:1], of_sigmas(DEVIATIONS[:1])),
+        errors=ERRORS[0], sigmas=DEVIATIONS[0]),
+    "mat of one run, steps last": Log(
+        mat(errors=ERRORS[0].T, covariances=np.moveaxis(COVARIANCES[0], 0, -1)), OF_ONE,
+        "runs.mat"),
+    "mat, runs last": Log(
+        mat(errors=ERRORS.T, covariances=COVARIANCES.T), OF_ERRORS, "runs.mat"),
     "npz of σ": npz_log(OF_DEVIATIONS, errors=ERRORS, sigmas=DEVIATIONS),
     "npz of innovations": npz_log(
         partial(OF_ERRORS, quantity="NIS"), innovations=ERRORS, covariances=COVARIANCES),
@@ -676,6 +753,11 @@ LOGS = {
     "CSV, σ": csv_log(
         partial(OF_DEVIATIONS, names="abcd"), PLACES, FLAT_ERRORS, DEVIATIONS.reshape(-1, 4),
         header=SIGMAS_NAMED,
+    ),
+    "CSV, each σ beside its error": csv_log(
+        partial(OF_DEVIATIONS, names="abcd"), PLACES,
+        np.stack([FLAT_ERRORS, DEVIATIONS.reshape(-1, 4)], axis=2).reshape(-1, 8),
+        header="run,step,a,sigma_a,b,sigma_b,c,sigma_c,d,sigma_d\n",
     ),
     "CSV, one run": csv_log(
         partial(jaxslam.evaluate, ERRORS[:1], COVARIANCES[:1], names="abcd"),

@@ -143,8 +143,8 @@ class EvaluateOptions:
             raise ValueError(f"{self.source} has no log: expected {expected}")
         suite, told = read_suite(folder, paths, self.seed), {}
         found = {name: self._of_log(paths[name], one) for name, one in suite.items()}
-        for name, (yours, numbers) in found.items():
-            told[name] = {"yours": numbers, **self._of_filters(name, suite[name])}
+        for name, (yours, content) in found.items():
+            told[name] = {"yours": content, **self._of_filters(name, suite[name])}
             lines = _comparison(f"{name}, {suite[name].runs} runs", told[name])
             doubt = [yours.identified.sentence] if yours.identified and yours.suggested else []
             print(*lines, f"yours: {yours.headline}", *doubt, "", sep="\n")

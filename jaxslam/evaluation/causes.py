@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import combinations
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -28,7 +29,6 @@ from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.io.tum import poses as poses_of
 from jaxslam.io.tum import quaternions
-from jaxslam.statistics.verdict import not_disproved
 
 ROUNDS, SMALL = 4, 1e-4
 """Steps of Gauss and Newton to the mounting, and those of its derivatives, in σ."""
@@ -46,6 +46,8 @@ HALF = 1.3
 """How near σ of all rotations, or positions, is to half angles (the right ones), as a factor."""
 MANY = 10
 """Poses that are equal by chance are fewer."""
+LENGTHS = 10.0, 100.0, 1000.0, 3.2808
+"""Factors between units of length."""
 WORSE = ("over-confident", "lost")
 Transform = Float[np.ndarray, "d d"]
 FEWEST, ALPHA = 4, 1e-3
@@ -59,9 +61,9 @@ def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
         return
     if (few := poses.some()) is not poses:
         poses, found = few, compared(few)
-    turns = poses.estimates.shape[-1] == 4 and any(name.startswith("r") for name in found.names)
-    told: list[Mistake] = []
-    for look in (_w_first, _worlds, _tilt, _mounting, _half_angles)[not turns : 4 + turns]:
+    turns, told = any(name.startswith("r") for name in found.names), list[Mistake]()
+    spatial = turns and poses.estimates.shape[-1] == 4
+    for look in (_misread, _tilt, _between, _half_angles)[not turns : 3 + spatial]:
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
@@ -75,15 +77,11 @@ def suspect(found: Evaluation) -> bool:
     return bool(found.mistakes) or found.verdict["word"] in WORSE
 
 
-def _right(found: Evaluation) -> bool:
-    return not found.mistakes and not_disproved(found.verdict)
-
-
 def explained(found: Evaluation) -> bool:
     """Whether nothing is left to be wrong by the verdict, which may allow for much, nor by what one
-    right pose in 200 reaches."""
-    # 2 n + 6 is the quantile of χ², for n from 1 to 6, of one in 150 to 200.
-    return found.of_nees["word"] not in WORSE and _nees(found) < 2 * found.dof + 6
+    right pose in 200 reaches, upwards or downwards."""
+    share = float(scipy.special.chdtr(found.dof, _nees(found)))
+    return not suspect(found) and found.of_nees["word"] not in WORSE and 0.005 < share < 0.995
 
 
 def _nees(found: Evaluation) -> float:
@@ -120,79 +118,95 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
             return
 
 
-def _w_first(poses: Poses, found: Evaluation) -> Mistake | None:
-    there = poses.logged
+def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
+    """Quaternions with w first, or poses of the world in the body."""
+    n, there = poses.estimates.shape[-1] - 1, poses.logged
 
-    def off(T: Matrices, true: Matrices) -> float:
-        turn = np.swapaxes(T[there][:, :3, :3], 1, 2) @ true[there][:, :3, :3]
+    def off(of: Poses) -> float:
+        R, true = (x[there][:, :n, :n] for x in (of.estimates, of.truths))
+        turn = np.swapaxes(R, 1, 2) @ true
         # Up to a constant, as of another world or body.
         return float(np.median(angles(turn, nearest_rotation(turn.mean(axis=0)))))
 
-    before = off(poses.estimates, poses.truths)
-    for name, changed in (
-        ("estimate", poses._replace(estimates=_reread(poses.estimates, there))),
-        ("truth", poses._replace(truths=_reread(poses.truths, there))),
-    ):
-        after = off(changed.estimates, changed.truths)
+    before, ones = off(poses), list[Mistake]()
+    ways = (
+        (_w_first, "quaternions", "have w first", "qx qy qz qw, or name the columns"),
+        (np.linalg.inv, "poses", "are inverse", "poses of the body in the world"),
+    )
+    for (change, what, are, write), name in product(ways[n < 3 :], ("estimate", "truth")):
+        read: dict[str, Any] = {f"{name}s": change(getattr(poses, f"{name}s"))}
+        changed = poses._replace(**read)
+        after = off(changed)
         fixed = compared(changed) if after < before else found
         # σ of rotations may be as large as what is left.
         far, near, less = before > np.radians(20), after < before / 4, _nees(found) / _nees(fixed)
-        if (far and near and less > CLEARLY) or (less > 10 and _right(fixed)):
+        if (far and near and less > CLEARLY) or (less > 10 and explained(fixed)):
             certain = bool(far and (near or len(there) >= FEWEST))
-            return Mistake(
-                f"quaternions of the {name} {'' if certain else 'may '}have w first",
-                f"rotations differ by {np.degrees(before):.3g}° (median); with the quaternions of "
-                f"the {name} read as qw qx qy qz {_instead(fixed, found)}; write qx qy qz qw, or "
-                "name the columns",
+            one = Mistake(
+                f"{what} of the {name} {are if certain else f'may {are}'.replace('are', 'be')}",
+                f"rotations differ by {np.degrees(before):.3g}° (median); without that "
+                f"{_instead(fixed, found)}; write {write}",
                 _nees(fixed),
                 certain,
             )
-    return None
+            ones.append(one)
+    return min(ones, key=lambda x: x.nees or 0.0, default=None)
 
 
-def _reread(T: Matrices, there: np.ndarray) -> Matrices:
+def _w_first(T: Matrices) -> Matrices:
     """Poses whose quaternions, read as x, y, z, w, are w, x, y, z."""
-    result = T.copy()
-    q = quaternions(T[there][:, :3, :3])
-    result[there] = poses_of(T[there][:, :3, 3], q[:, [1, 2, 3, 0]])
-    return result
+    flat = T.reshape(-1, 4, 4)
+    q = quaternions(flat[:, :3, :3])[:, [1, 2, 3, 0]]
+    return poses_of(flat[:, :3, 3], q).reshape(T.shape)
+
+
+def _between(poses: Poses, found: Evaluation) -> Mistake | None:
+    """Two bodies or two worlds, whichever explains more; a world has fewer numbers."""
+    body = _mounting(poses, found)
+    with suppress(ValueError):  # positions coincide
+        world = _worlds(poses, found) if poses.align == "none" else None
+        most = CLEARLY * max(world.nees or 0.0, found.dof) if world else np.inf
+        if world and not (body and (body.nees or 0.0) < most):
+            return world
+    return body
 
 
 def _worlds(poses: Poses, found: Evaluation) -> Mistake | None:
-    """Positions that agree after an alignment, by a large rotation or of first poses apart."""
-    if poses.align != "none":
-        return None
+    """Positions that agree after an alignment, by a large rotation, of first poses apart, or of
+    another unit of length."""
     n = poses.estimates.shape[-1] - 1
     rows = [
         _apart(*(x[run, there, :n, n] for x in (poses.estimates, poses.truths)))
         for run, there in enumerate(poses.logged)
     ]
-    rms, left, scaled, first, angle, tilt = np.median(rows, axis=0)
+    rms, left, scaled, scale, first, angle, tilt = np.median(rows, axis=0)
     own = found.sigmas[found.logged][:, [not name.startswith("r") for name in found.names]]
     sigma = float(np.median(own)) * (1 if len(rows) >= FEWEST else 2) if own.size else 0.0
-    if rms <= 5 * max(left, 1e-12) or (first <= max(0.2 * rms, 5 * sigma) and angle <= TURNED):
-        return None
     by = "yaw" if n == 3 and tilt < np.radians(2) else "se3"
-    by = "sim3" if scaled < left / LESS else by
-    fixed, body = compared(poses._replace(align=by)), _mounting(poses, found)
-    if body and (body.nees or 0.0) < CLEARLY * max(_nees(fixed), found.dof):
-        return None  # that is told in its turn
+    by, left = ("sim3", scaled) if scaled < left / LESS else (by, left)
+    apart = first > max(0.2 * rms, 5 * sigma) or angle > TURNED
+    apart |= by == "sim3" and np.isclose(max(scale, 1 / scale), LENGTHS, rtol=0.02).any()
+    if rms <= 5 * max(left, 1e-12) or not apart:
+        return None
+    fixed = compared(poses._replace(align=by))
     return Mistake(
         "estimate and truth are not in one world",
         f"positions differ by {rms:.3g} m (RMS) and by {left:.3g} m once aligned, by "
-        f"{np.degrees(angle):.3g}°: with --align {by} {_instead(fixed, found)}",
+        f"{np.degrees(angle):.3g}°{f' and a factor of {scale:.4g}' * (by == 'sim3')}: with "
+        f"--align {by} {_instead(fixed, found)}",
         _nees(fixed),
     )
 
 
 def _apart(p: Float[np.ndarray, "k n"], true: Float[np.ndarray, "k n"]) -> list[float]:
     """How far positions of a run are from true ones (RMS): as they are, aligned, and scaled too;
-    the first of them; and the angle of the alignment, and that of its vertical."""
+    the scale; the first of them; and the angle of the alignment, and that of its vertical."""
     fits = [similarity(p, true, scaled=scaled) for scaled in (False, True)]
     moved = (x.scale * p @ x.rotation.T + x.translation for x in fits)
     R, first = fits[0].rotation, float(np.linalg.norm(p[0] - true[0]))
     tilt = float(np.arccos(np.clip(R[-1, -1], -1, 1)))
-    return [*(_rms(x - true) for x in (p, *moved)), first, float(angles(R, np.eye(len(R)))), tilt]
+    off = (_rms(x - true) for x in (p, *moved))
+    return [*off, fits[1].scale, first, float(angles(R, np.eye(len(R)))), tilt]
 
 
 def _tilt(poses: Poses, found: Evaluation) -> Mistake | None:
@@ -205,7 +219,7 @@ def _tilt(poses: Poses, found: Evaluation) -> Mistake | None:
         return None
     other, why = others[poses.align]
     fixed = compared(poses._replace(align=other))
-    if not _right(fixed) or _nees(fixed) > _nees(found) / 1.2:
+    if not explained(fixed) or _nees(fixed) > _nees(found) / 1.2:
         return None
     told = f"{why}: with --align {other} {_instead(fixed, found)}"
     certain = len(poses.logged) >= FEWEST
@@ -227,7 +241,7 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     n = len(X) - 1
     angle, metres = float(angles(X[:n, :n], np.eye(n))), float(np.linalg.norm(X[:n, n]))
     certain = _of_body(poses, found, best, angle)
-    certain = bool(certain or (_right(best) and _in_all_runs(X, moved)))
+    certain = bool(certain or (explained(best) and _in_all_runs(X, moved)))
     if not certain and not explained(best):
         return None
     parts = [f"a constant rotation of {np.degrees(angle):.4g}°"] if angle > 0 else []
@@ -341,7 +355,7 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
         off = np.log([part.axis_verdict(i)["sigma_factor"] or np.inf for i in range(len(names))])
         # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
         certain &= bool(abs(off.mean()) <= np.log(HALF) and np.ptp(off) <= 3 * np.log(HALF))
-    if not explained(fixed) or not (certain or _right(fixed)):
+    if not explained(fixed) or not (certain or explained(fixed)):
         return None
     return Mistake(
         "half angles" if certain else "the covariances may be of half angles",

@@ -76,7 +76,8 @@ def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:
     """The poses with the names of the axes that are estimated, and a word on those that are not.
 
     An axis is left out where all its errors are zero, to nine decimals; or are less
-    than a thousandth of σ, and have no correlation with those of other axes.
+    than a thousandth of σ, and have no correlation with those of other axes; or where its variance
+    is zero at every pose.
     """
     names, few = poses.names, poses.some()
     if few is not poses and not with_axes(few)[1]:
@@ -90,7 +91,7 @@ def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:
     scale = np.where(sigma > 0, sigma, 1.0)
     correlation = np.abs(P) / scale[:, :, None] / scale[:, None] * (1 - np.eye(P.shape[-1]))
     alone = (correlation <= 1e-6).all(axis=(0, 1))
-    none = (np.abs(e) <= ROUNDING).all(axis=0)
+    none = (np.abs(e) <= ROUNDING).all(axis=0) | ~variance.any(axis=0)
     # Errors that are less of σ at every pose are no errors.
     none |= alone & (np.abs(e) <= 1e-3 * sigma).all(axis=0)
     if none.all() or not none.any():
@@ -98,8 +99,8 @@ def with_axes(poses: Poses) -> tuple[Poses, tuple[str, ...]]:
     told = list(zip(names, none, strict=True))
     left, used = (tuple(name for name, out in told if out == which) for which in (True, False))
     return poses._replace(used=used), (
-        f"{', '.join(left)}: not estimated, as errors are zero, or below a thousandth of σ; left "
-        f"out, as with --axes-used {','.join(used)}",
+        f"{', '.join(left)}: not estimated, as errors are zero, or below a thousandth of σ, or σ "
+        f"is zero; left out, as with --axes-used {','.join(used)}",
     )
 
 

@@ -33,14 +33,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.files import LARGEST
+from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
 from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, symmetric
-from jaxslam.io.logs.unnamed import is_deviations, without_values
-from jaxslam.io.text import Table, read_table
-from jaxslam.io.tum import write_table
+from jaxslam.io.logs.unnamed import is_deviations
+from jaxslam.io.text import Table, read_table, without_values
+from jaxslam.io.tum import table_text
 
 Joints = Float[np.ndarray, "runs k k"]
 """Covariances of all poses of a run together."""
@@ -300,7 +300,7 @@ def write_covariances(
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(_ROWS, _COLUMNS, strict=True))
     remark = f"; {remark}" if remark else ""
     header = f"{pairs} ({convention} angle=rad length={length}{remark})"
-    write_table(path, header, times, table, "covariances", ".9e")
+    write_text(path, table_text(header, times, table, "covariances", ".9e"))
 
 
 def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:

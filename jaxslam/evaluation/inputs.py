@@ -121,11 +121,8 @@ def padded(
         return e, P, np.zeros(e.shape[:2], int)
     e, P = e.astype(np.float64), P.astype(np.float64)
     there = ~(np.isnan(e) & np.isnan(np.diagonal(P, axis1=-2, axis2=-1)))
-    some = there.any(axis=-1, keepdims=True)
-    without = ~there & some
-    e[without] = 0.0
-    P[without] = 0.0
-    np.swapaxes(P, -1, -2)[without] = 0.0
+    without = ~there & there.any(axis=-1, keepdims=True)
+    e, P = np.where(without, 0.0, e), np.where(without[..., None] | without[..., None, :], 0.0, P)
     P[..., range(e.shape[-1]), range(e.shape[-1])] += without
     return e, P, there.sum(axis=-1)
 
@@ -442,11 +439,23 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     arrays = {k: x for k, x in pickle.loads(done.stdout).items() if not k.startswith("__")}
     for name in {"names", *CHOICES} & arrays.keys():  # cells, or a matrix of letters
         arrays[name] = np.array([str(np.ravel(x)[0]).strip() for x in arrays[name].ravel()])
-    if "dof" in arrays and arrays["dof"].size == 1:
-        arrays["dof"] = arrays["dof"].ravel()
-    return {name: value.ravel() if name == "times" else value for name, value in arrays.items()}
+    return {k: x.ravel() if k == "times" or x.size == 1 else x for k, x in arrays.items()}
 
 
+def by_runs(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of one run, which have no axis of runs, as those of runs; and those of MATLAB, errors
+    (n, steps) and covariances (n, n, steps), with their steps first."""
+    P, each = arrays.get("covariances", np.empty(0)), {*_OF_STEPS} & arrays.keys()
+    if P.ndim > 2 and P.shape[0] == P.shape[1] and P.shape[-1] != P.shape[-2]:
+        arrays = arrays | {key: arrays[key].T for key in each}
+    one = any(arrays[key].ndim == _OF_STEPS[key] for key in each)
+    return arrays | {key: arrays[key][None] for key in each if one and arrays[key].ndim}
+
+
+_OF_STEPS = {"nees": 1, "nis": 1, "errors": 2, "innovations": 2, "estimates": 2} | dict.fromkeys(
+    ("covariances", "sigmas", "truths", "dof"), -1
+)
+"""The numbers of axes of arrays that have none of runs, where that shows it."""
 ARRAYS = {".npz": read_arrays, ".mat": read_mat}
 """What reads the arrays of a file."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
@@ -465,7 +474,10 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
     """
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
     table = read_table(path, "log", "errors", row)
-    titles, rows, lines = [*table.titles], table.rows, table.lines
+    # Each σ may stand beside its error.
+    order = sorted(range(len(table.titles)), key=lambda i: bool(_SIGMA.match(table.titles[i])))
+    titles = [table.titles[i] for i in order]
+    rows = table.rows[:, order] if order else table.rows
     found = _columns(titles, rows)
     if found is None:
         told = f" ({', '.join(titles)})" if titles else ""
@@ -478,7 +490,7 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
     without, finite = errors.all(axis=1) | (P.all(axis=1) & (n > 0)), np.isfinite(rows)
     table.check(~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1)), row)
     told = rows[:, :2] if before == 2 else np.column_stack([np.zeros(len(rows)), rows[:, 0]])
-    places, runs, steps = _rectangle(path, told, lines)
+    places, runs, steps = _rectangle(path, told, table.lines)
 
     values = np.full((len(runs), len(steps), rows.shape[1] - before), np.nan)
     values[places] = rows[:, before:]

@@ -15,7 +15,7 @@ from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
 from jaxslam.evaluation.causes import explained, suspect
 from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
-from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_csv
+from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, by_runs, of_sigmas, read_csv
 from jaxslam.evaluation.pairing import (
     Place,
     RunFiles,
@@ -109,7 +109,7 @@ def evaluate_log(
 def _of_arrays(source: Path, stated: dict[str, str], how: Options, nis: bool) -> Evaluation:
     read = ARRAYS.get(source.suffix)
     arrays, runs, steps = (read(source), (), ()) if read else read_csv(source)
-    found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
+    found = named(source, lambda: _evaluate_arrays(by_runs(arrays), stated, how, nis), runs, steps)
     told = (advice(found),) if found.quantity == "NIS" and found.names else ()
     return described(found, run_names=runs, notes=(*found.notes, *told))
 
@@ -153,7 +153,7 @@ def _evaluate_arrays(
     return evaluate(given, arrays["covariances"], times=times, names=names, quantity=quantity)
 
 
-ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
+ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt", "traj_estimate.txt")
 COVARIANCES = ("covariance.txt", "state_deviation.txt")
 TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt", "reference.txt", "ref.txt")
 LOOKED_AT = 10
@@ -240,9 +240,9 @@ def _run(folder: Path, covariance: Path | None, truth: str | Path | None) -> Run
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
-    """The one file of these names, of any ending of a text. Raises ValueError where there are two,
-    maybe of two runs."""
-    stems = [Path(name).stem for name in names]
+    """The one file of these names, of any ending of a text, `stamped_` or not. Raises ValueError
+    where there are two, maybe of two runs."""
+    stems = [x for name in names for x in (Path(name).stem, f"stamped_{Path(name).stem}")]
     files = (x for x in folder.glob("*") if x.stem in stems and x.suffix in TEXTS and x.is_file())
     there = sorted(files, key=lambda path: (stems.index(path.stem), path.suffix))
     if len(there) > 1:

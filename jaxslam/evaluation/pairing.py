@@ -43,8 +43,9 @@ SPARSE = 3.0
 """The number of poses to every true one from which the estimate is taken at the truth's stamps."""
 ROUNDED = 1e-4
 """The share of the time between two poses by which stamps that are rounded are others."""
-EPOCHS = (18.0, 315964800.0 - 18.0, 315964800.0)
-"""Seconds between GPS time and UTC since 2017, and between the epochs of GPS and of Unix."""
+LEAPS, GPS_EPOCH, WEEK, HALF_HOUR = 18.0, 315964800.0, 604800.0, 1800.0
+"""Seconds from UTC to GPS time since 2017, from the epoch of Unix to that of GPS, of a week, and
+between the clocks of two zones."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 _SAME = Convention("split", "mixed")
 
@@ -107,24 +108,24 @@ def read(place: Place) -> Log:
 
     Raises ValueError, naming the place.
     """
-    log = ros.read_poses(place) if isinstance(place, ros.Topic) else read_log(place)
+    of_topic = isinstance(place, ros.Topic)
+    return _in_order(place, ros.read_poses(place) if of_topic else read_log(place))
+
+
+def _in_order(place: Place, log: Log) -> Log:
     back = log.times < np.maximum.accumulate(log.times)
     if 0 < back.sum() <= BACK * len(back):
         log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
-    last = _last_of_each(log.times)
+    last = np.append(np.diff(log.times) > 0, True)
     told = f"stamps that are doubled: {np.sum(~last)}; of each the last pose is used"
     return log if last.all() else _of_rows(log, last, told)
 
 
 def _of_rows(log: Log, rows: Bool[np.ndarray, " n"], note: str) -> Log:
-    P = log.covariances[rows] if len(log.covariances) else log.covariances
-    times, poses, notes = log.times[rows], log.poses[rows], (*log.notes, note)
+    poses, P = (x[rows] if len(x) else x for x in (log.poses, log.covariances))
+    times, notes = log.times[rows], (*log.notes, note)
     return log._replace(times=times, poses=poses, covariances=P, notes=notes)
-
-
-def _last_of_each(times: Times) -> Bool[np.ndarray, " n"]:
-    return np.append(np.diff(times) > 0, True)
 
 
 def read_run(run: RunFiles) -> RunLogs:
@@ -142,10 +143,7 @@ def read_run(run: RunFiles) -> RunLogs:
     if run.covariance is not None:
         t = geometry_of(log.poses).tangent_dim
         own = covariances_of_file(run.covariance, t, positions=not log.oriented)
-        own = _stamped_by(log.times, own)
-        _check_times(run.covariance, own.times)
-        last = _last_of_each(own.times)
-        own = own._replace(times=own.times[last], covariances=own.covariances[last])
+        own = _in_order(run.covariance, _stamped_by(log.times, own))
     elif not len(log.covariances):
         raise ValueError(
             f"{run.estimate} has no covariances; give them by --covariance FILE (beside "
@@ -263,18 +261,20 @@ def _nothing_in_common(run: RunFiles, other: Place, *times: np.ndarray) -> Value
     spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in times)
     return ValueError(
         f"{run.estimate} and {other} have no time stamps in common {_WITHIN}: {spans}"
-        + _of_gps(*times)
+        + (_of_clocks(*times) or ". If one clock is known to be late, say --time-offset SECONDS")
     )
 
 
-def _of_gps(own: Times, others: Float[np.ndarray, " m"]) -> str:
-    """The offset that GPS would have, where both would begin together without it; else nothing."""
-    late = own.min() - others.min()
-    longest = max(np.ptp(own), np.ptp(others))
-    for apart in EPOCHS:
+def _of_clocks(own: Times, others: Float[np.ndarray, " m"]) -> str:
+    """The offset of a known clock, if both would begin together without it; else nothing."""
+    late, longest = own.min() - others.min(), max(np.ptp(own), np.ptp(others))
+    weeks = GPS_EPOCH + WEEK * max(round((abs(late) - GPS_EPOCH) / WEEK), 0)
+    zones = HALF_HOUR * min(round(abs(late) / HALF_HOUR), 28)
+    clocks = {LEAPS: "GPS time", LEAPS + 19: "TAI, as of PTP", zones: "another zone"}
+    for apart, clock in (clocks | {weeks - LEAPS: "GPS time", weeks: "GPS time"}).items():
         if abs(abs(late) - apart) < min(longest, 0.01 * apart):
             told = f"--time-offset {np.copysign(apart, late):.0f}"
-            return f". One may be of GPS time, which is {apart:.0f} s off: then say {told}"
+            return f". One may be of {clock}, which is {apart:.0f} s off: then say {told}"
     return ""
 
 
@@ -431,7 +431,7 @@ def _check_share(logs: RunLogs, log: Log, true: Matrices, why: list[str]) -> Non
         f"{np.sum(others[1][2])} a truth. {path} has {_held(times)}; the nearest one "
         f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
         "covering half the duration of the estimate"
-        + ("".join(f". Here {x}" for x in why) or _of_gps(own, times))
+        + ("".join(f". Here {x}" for x in why) or _of_clocks(own, times))
     )
 
 

@@ -301,9 +301,6 @@ class Evaluation:
             raise ValueError(f"{folder}: cannot write there ({error.strerror})") from None
         return path
 
-    def __repr__(self) -> str:
-        return str(self)
-
     def _repr_html_(self) -> str:
         return _html(self, _told(self))
 
@@ -315,6 +312,8 @@ class Evaluation:
         table = _in_columns(*_rows(self)) if self.names else []
         counted = [_counted(self), _covered(self)]
         return "\n".join([_told(self), "", *counted, *table, *self.remarks])
+
+    __repr__ = __str__
 
     @property
     def remarks(self) -> list[str]:
@@ -351,27 +350,22 @@ def _as_json(evaluation: Evaluation) -> dict[str, Json]:
 
     names, bias, found = [*enumerate(evaluation.names)], evaluation.bias, evaluation.correlation
     outside, rmse, sigma = evaluation.outside3sigma, evaluation.rmse, evaluation.sigma
+    plain = "quantity", "runs", "steps", "dof", "inside", "lost_runs", "coverage", "fitted"
     return {
         "schema": 1,
         "version": __version__,
-        "quantity": evaluation.quantity,
-        "runs": evaluation.runs,
-        "steps": evaluation.steps,
-        "dof": evaluation.dof,
+        **{name: getattr(evaluation, name) for name in plain},
         "time": json_numbers(evaluation.times),
         "band95": list(evaluation.band95),
         "nees": json_numbers(evaluation.mean),
         "runs_of_step": evaluation.runs_of_step.tolist(),
         "band95_of_step": evaluation.band95_of_step.tolist(),
-        "inside": evaluation.inside,
         "verdict": evaluation.verdict,
         "run_names": list(evaluation.run_names),
-        "lost_runs": evaluation.lost_runs,
         "outside3sigma": {name: float(outside[i]) for i, name in names},
         "rmse": {name: json_numbers(rmse[:, i]) for i, name in names},
         "sigma": {name: json_numbers(sigma[:, i]) for i, name in names},
         "axis_verdict": {name: evaluation.axis_verdict(i) for i, name in names},
-        "coverage": evaluation.coverage,
         "effective_samples": evaluation.of_nees.get("effective"),
         "time_offset": evaluation.time_offset
         and dict(zip(("seconds", "sigma"), evaluation.time_offset, strict=True)),
@@ -382,15 +376,11 @@ def _as_json(evaluation: Evaluation) -> dict[str, Json]:
         "bias": bias
         and {x: {"mean": float(bias.mean[i]), "p": float(bias.p[i])} for i, x in names},
         "correlation": found
-        and {
-            "matrix": found.matrix.tolist(),
-            "axes": [evaluation.names[i] for i in found.axes],
-            "p": found.p,
-        },
-        "convention": evaluation.convention and asdict(evaluation.convention),
+        and {"axes": [evaluation.names[i] for i in found.axes], "p": found.p}
+        | {"matrix": found.matrix.tolist()},
         "alignment": evaluation.alignment,
+        "convention": evaluation.convention and asdict(evaluation.convention),
         "truth_sigma": evaluation.truth_sigma and list(evaluation.truth_sigma),
-        "fitted": evaluation.fitted,
         "scale": evaluation.scale and evaluation.scale.asdict(),
         "suggested": evaluation.suggested and asdict(evaluation.suggested),
         "identified": evaluation.identified and evaluation.identified.asdict(),

@@ -20,7 +20,7 @@ from jaxslam.io.recording import (
     read_timestamps,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.text import read_table, rows_of, text_lines
+from jaxslam.io.text import read_table, table_of, text_lines
 from jaxslam.io.tum import Times, transforms
 
 CAMERAS = ("0", "2")
@@ -43,7 +43,10 @@ def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
     for number, line in text_lines(path).items():
         name, _, rest = line.partition(":")
         if name.strip() == f"P{camera}":
-            told = rows_of(path, {number: rest.split()}, 12, f"P{camera}: and twelve numbers")
+            row = f"P{camera}: and twelve numbers"
+            told = table_of(path, {number: rest}, "matrix", row).numbers(
+                row, range(12), spare=False
+            )
             P = told.reshape(3, 4)
             if not (np.diagonal(P) != 0).all():
                 wrong = "not a projection matrix with a positive focal length"

@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
-DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
-"""A date and time of ISO 8601, which is a cell, in whatever columns."""
+DATE = re.compile(r"(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d)")
+"""A date and time, which are a cell, in whatever columns."""
+ISO = r"\1-\2-\3T\4"
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
@@ -63,11 +64,16 @@ class Table(NamedTuple):
         if max(columns) >= count or not (spare or len(columns) == count):
             raise ValueError(f"{self.place(0)}: expected {expected}")
         found = self.rows[:, columns]
-        without = none & np.isnan(found[:, 1:]).all(axis=1)
+        without = none & without_values(found)
         finite = np.isfinite(found[:, 0]) & (without | np.isfinite(found).all(axis=1))
         self.check(~finite, expected)
         self.check((np.abs(found) > LARGEST).any(axis=1), f"numbers up to {LARGEST:.0e}")
         return found
+
+
+def without_values(rows: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
+    """A mask of the rows that have a time and NaN."""
+    return np.asarray(np.isnan(rows[:, 1:]).all(axis=1))
 
 
 def text_lines(path: str | Path, what: str = "file", *, comments: bool = False) -> dict[int, str]:
@@ -104,7 +110,7 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
 def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
     """The same of the lines of a file."""
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
-    lines = {n: DATE.sub(r"\1T\2", line) for n, line in told.items() if not _is_comment(line)}
+    lines = {n: DATE.sub(ISO, line) for n, line in told.items() if not _is_comment(line)}
     named = []
     while lines and not any(_number(cell) is not None for cell in cells(lines[min(lines)])):
         named.append(lines.pop(min(lines)))
@@ -123,16 +129,12 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
             raise ValueError(f"{path}, line {number}: expected {row}")
         if not rows:
             words = {i: [] for i, x in enumerate(found) if x and _number(x) is None}
-        values = []
-        for i, cell in enumerate(found):
-            value = math.nan if not cell else _number(cell)
-            if i in words:
-                words[i].append(cell)
-                value = math.nan
-            elif value is None:
-                raise ValueError(f"{path}, line {number}: expected {row}")
-            values.append(value)
-        rows.append(values)
+        for i, column in words.items():
+            column.append(found[i])
+            found[i] = ""
+        rows.append([_number(cell) if cell else math.nan for cell in found])
+        if None in rows[-1]:
+            raise ValueError(f"{path}, line {number}: expected {row}")
     index = int(titles[:1] == ("",))  # a first column without a title, as of pandas
     by_column = {i - index: tuple(column) for i, column in words.items()}
     values = np.array(rows)[:, index:]
@@ -190,17 +192,6 @@ def numbers(told: Sequence[str], count: int) -> list[float] | None:
     """Read words as `count` finite numbers up to `LARGEST`; None if they are not."""
     found = [x for word in told if (x := _number(word)) is not None and abs(x) <= LARGEST]
     return found if len(found) == len(told) == count else None
-
-
-def rows_of(
-    path: Path, told: Mapping[int, Sequence[str]], count: int, expected: str
-) -> Float[np.ndarray, "n count"]:
-    """The words of lines, by their numbers, as `count` numbers each. Raises ValueError, naming the
-    line."""
-    rows = {line: numbers(words, count) for line, words in told.items()}
-    for line in (line for line, row in rows.items() if row is None):
-        raise ValueError(f"{path}, line {line}: expected {expected}, up to {LARGEST:.0e}")
-    return np.array(list(rows.values())).reshape(-1, count)
 
 
 def numbers_of(told: object) -> list[float]:

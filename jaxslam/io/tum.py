@@ -85,19 +85,10 @@ def tum_text(times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> str:
     Quaternions are normalised, w comes last and is not negative. The `remark` is for the header.
     """
     T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
-    table = np.empty((len(T_wc), 7))
-    table[:, :3] = T_wc[:, :3, 3]
-    table[:, 3:] = quaternions(T_wc[:, :3, :3])
+    table = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])])
     remark = f"; {remark}" if remark else ""
     header = f"tx ty tz qx qy qz qw (s; camera in the world frame{remark})"
     return table_text(header, times, table, "poses", ".9f")
-
-
-def write_table(
-    path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
-) -> None:
-    """Write what `table_text` makes of them, whole or not at all."""
-    write_text(path, table_text(header, times, table, what, number))
 
 
 def table_text(header: str, times: ArrayLike, table: np.ndarray, what: str, number: str) -> str:
@@ -105,10 +96,9 @@ def table_text(header: str, times: ArrayLike, table: np.ndarray, what: str, numb
     times = np.asarray(times, dtype=float)
     if times.shape != (len(table),):
         raise ValueError(f"{len(times)} times for {len(table)} {what}; their numbers must be equal")
-    lines = [f"# t {header}"]
-    for time, row in zip(times, table, strict=True):
-        lines.append(f"{time:.9f} " + " ".join(format(value, number) for value in row))
-    return "\n".join(lines) + "\n"
+    rows = (" ".join(format(value, number) for value in row) for row in table)
+    lines = (f"{time:.9f} {row}\n" for time, row in zip(times, rows, strict=True))
+    return f"# t {header}\n{''.join(lines)}"
 
 
 def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:

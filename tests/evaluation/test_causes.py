@@ -9,6 +9,7 @@ from verdicts import displaced
 
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_poses
 from jaxslam.evaluation.sanity_checks import Mistake
+from jaxslam.geometry import PLANAR
 
 SPLIT = Convention("split", "world")
 STEPS = 25
@@ -33,12 +34,29 @@ def of_truth(rng, log):
     return log._replace(dense=swapped)
 
 
+def inverse(rng, log):
+    return log._replace(estimates=np.linalg.inv(log.estimates))
+
+
+def of_inverse_truth(rng, log):
+    return log._replace(dense=np.linalg.inv(log.dense))
+
+
+def in_millimetres(rng, log):
+    truths = log.dense.copy()
+    truths[..., :3, 3] *= 1e3
+    return log._replace(dense=truths)
+
+
 FAULTS = {
     name: (fault.put, fault.word)
     for name, fault in benchmark.FAULTS.items()
     if fault.word and not fault.written and fault.word != benchmark.CONVENTION
 } | {
     "w first, of the truth": (of_truth, "of the truth have w first"),
+    "the world in the body": (inverse, "poses of the estimate are inverse"),
+    "the world in the body, of the truth": (of_inverse_truth, "poses of the truth are inverse"),
+    "truth in millimetres": (in_millimetres, "not in one world"),
 }
 
 
@@ -53,6 +71,34 @@ def test_a_fault_between_the_logs_is_named_with_the_nees_without_it(put, word):
     assert 0.7 * NEES < without < 1.2 * NEES
     assert found.verdict["word"] == "cannot tell"
     assert found.headline.startswith("no verdict: ")
+
+
+def test_another_unit_of_length_is_named_by_its_factor_in_one_run_too():
+    log, rng = flight()
+    one = in_millimetres(rng, log)
+    one = one._replace(**{x: getattr(one, x)[:1] for x in ("estimates", "covariances", "dense")})
+    for found in (evaluated(in_millimetres(rng, log)), evaluated(one)):
+        (cause,) = found.mistakes
+        factor = float(cause.told.partition("a factor of ")[2].partition(":")[0])
+        assert factor == pytest.approx(1e3, rel=0.02)
+        assert "--align sim3" in cause.told
+
+
+def test_poses_in_the_plane_may_be_inverse_too():
+    T, P, true = logged(Convention("split"), PLANAR, runs=8, steps=STEPS)
+    (cause,) = evaluate_poses(np.linalg.inv(T), P, true, Convention("split")).mistakes
+    assert cause.what == "poses of the estimate are inverse"
+
+
+def test_a_convention_in_which_errors_are_far_too_small_explains_nothing():
+    """The heading of wheel odometry is unknown, and its position too sure: rotation first, no error
+    would be as large as a thousandth of σ."""
+    rng = np.random.default_rng(0)
+    T, drift = np.tile(np.eye(3), (1, 300, 1, 1)), 0.05 * rng.normal(size=(300, 3)).cumsum(axis=0)
+    P = np.tile(np.diag([1e-3, 1e-3, 1e3]), (1, 300, 1, 1))
+    true = displaced(T, drift[None] * [1, 1, 0.1], Convention("split"))
+    found = evaluate_poses(T, P, true, Convention("split"))
+    assert found.verdict["word"] == "over-confident"
 
 
 def test_w_first_is_named_where_rotations_are_uncertain_too():

@@ -269,6 +269,17 @@ def test_of_the_axes_used_alone_a_folder_is_evaluated_and_drawn(tmp_path):
     assert labels == ["m", "rad"]
 
 
+def test_an_axis_whose_variance_is_always_zero_is_not_estimated():
+    """The height of a truth is that of a body above the plane, which the filter does not know."""
+    T, P, truth, nees = planar(other=0.0)
+    truth = truth.copy()
+    truth[..., 2, 3] += 0.05
+    found = jaxslam.evaluate_poses(T, P, truth, SPLIT)
+    assert found.names == ("x", "y", "rz")
+    np.testing.assert_allclose(found.nees, nees, rtol=1e-6)
+    assert "or σ is zero; left out, as with --axes-used x,y,rz" in str(found)
+
+
 @pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])
 def test_an_axis_of_small_errors_is_estimated_where_it_is_correlated(correlation, left_out):
     """Heights that are off by a millionth of their σ; with a correlation, they are told by x."""

@@ -11,7 +11,8 @@ from refusals import refused
 TEXTS = [name for name in LOGS if not (name.startswith(("npz", "mat", "bag")) or "16" in name)]
 UNSAID = {
     "TUM and a triangle", "TUM, variances by titles", "titles of angles in degrees, and σ",
-    "titles of PlotJuggler and ROS 2", "titles of ROS' CSV with covariances",
+    "titles of PlotJuggler and ROS 2", "titles of ROS' CSV with covariances", "titles of PX4",
+    "echo of ROS 2",
 }  # fmt: skip
 """Logs that do not say of which error their covariances are."""
 TABLES = [name for name in TEXTS if name.startswith("CSV")]
@@ -116,3 +117,11 @@ def test_a_file_that_is_missing_is_named(written):
         kept = path.rename(path.with_suffix(".away"))
         refused(evaluated, "has (no|neither) ")
         kept.rename(path)
+
+
+def test_a_number_that_is_too_large_to_be_squared_is_refused(tmp_path):
+    LOGS["TUM"].write(tmp_path)
+    for text in ("1 2 3 4 1e200 0 1\n", "t,x,y,z,sx,sy,sz\n0,1,2,3,1e200,1,1\n"):
+        (tmp_path / "truth.txt").write_text(text)
+        with pytest.raises(ValueError, match=r"truth\.txt"):
+            LOGS["TUM"].evaluated(tmp_path)

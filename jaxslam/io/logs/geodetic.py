@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.logs.log import Log, symmetric
-from jaxslam.io.text import Table, rows_of
+from jaxslam.io.text import Table, table_of
 from jaxslam.io.tum import Times, transforms
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -23,41 +22,45 @@ EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 GPS_EPOCH = 315964800.0
 """Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
 WEEK = 604800.0
-SAID = {"error": "split", "axes": "body"}
-NOTE = "x, y, z are east, north and up; times are those of GPS"
-_RTKLIB = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)"
+SAID, ENU = {"error": "split", "axes": "body"}, "east, north and up"
+NOTE = "x, y, z are {}; times are those of GPS"
+_RTKLIB = {
+    "latitude(deg) longitude(deg) height(m)": "sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)",
+    "x-ecef(m) y-ecef(m) z-ecef(m)": "sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)",
+    "e-baseline(m) n-baseline(m) u-baseline(m)": "sde(m) sdn(m) sdu(m) sden(m) sdnu(m) sdue(m)",
+}
+"""The titles of RTKLIB's positions, and those of their σ and signed roots of covariances."""
+_LEAPS = (1230768000.0, 1341100800.0, 1435708800.0, 1483228800.0)
+"""When GPS has been 15, 16, 17 and 18 s ahead of UTC since, in seconds of UTC."""
 _NOVATEL = re.compile(r"UTCTime\s+Week\s+GPSTime\s+Latitude\s+Longitude\s+H-Ell")
 
 
 def read_rtklib(table: Table) -> Log | None:
-    """Lines of a time in two cells, degrees, m, quality, and σ with signed roots of covariances;
-    None of another table. Raises ValueError, naming the line."""
-    if not any(" ".join(_RTKLIB.split()[:3]) in " ".join(line.split()) for line in table.comments):
+    """Lines of a time in two cells, a position, quality, and σ with signed roots of covariances;
+    None of another table. Raises ValueError, naming the line.
+
+    Positions are geodetic, of the Earth's frame, or from the base station, as the titles say.
+    """
+    titles = [re.sub(r"[\s,;]+", " ", line) for line in table.comments]
+    found = [(line, places) for line in titles for places in _RTKLIB if f"{places} Q" in line]
+    if not found:
         return None
-    expected = f"finite numbers: a time of GPS in two cells, and {_RTKLIB}"
-    if table.rows.shape[1] < 13:
-        raise ValueError(f"{table.place(0)}: expected {expected}")
-    times = _week_or_date(table, expected)
-    told = table.numbers(expected, range(2, 13))
-    latitude, longitude, height = told[:, 0], told[:, 1], told[:, 2]
-    n, e, u, ne, eu, un = told[:, 5:].T
-    roots = np.column_stack([e, n, u, ne, eu, un])
-    places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
-    P = symmetric(np.sign(roots) * roots**2, places)
-    return _log(times, np.radians(latitude), np.radians(longitude), height, P)
-
-
-def _week_or_date(table: Table, expected: str) -> Float[np.ndarray, " n"]:
-    if 0 not in table.words:
-        weeks, seconds = table.numbers(expected, [0, 1]).T
-        return GPS_EPOCH + WEEK * weeks + seconds
-    clock = table.words.get(1, ())
-    try:
-        both = zip(table.words[0], clock, strict=True)
-        dates = [datetime.strptime(f"{d} {t}", "%Y/%m/%d %H:%M:%S.%f") for d, t in both]
-    except ValueError:
-        raise ValueError(f"{table.place(0)}: expected {expected}") from None
-    return np.array([date.replace(tzinfo=UTC).timestamp() for date in dates])
+    line, places = found[0]
+    expected = f"finite numbers: a time in two cells, and {places} Q ns {_RTKLIB[places]}"
+    weeks = table.rows[:, 0].max() < WEEK  # which are in two cells, as dates are not
+    told = table.numbers(expected, range(12 + weeks))
+    if line.startswith("UTC"):
+        told[:, 0] += 14 + np.searchsorted(_LEAPS, told[:, 0])
+    times = GPS_EPOCH + WEEK * told[:, 0] + told[:, 1] if weeks else told[:, 0]
+    p, roots = told[:, 1 + weeks :][:, :3], told[:, 6 + weeks :]
+    geodetic = places.startswith("latitude")
+    roots = roots[:, [1, 0, 2, 3, 5, 4]] if geodetic else roots
+    P = symmetric(np.sign(roots) * roots**2, [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)])
+    if geodetic:
+        return _log(times, *np.radians(p[:, :2]).T, p[:, 2], P)
+    world = "ECEF" if places.startswith("x") else ENU
+    T, note = transforms(np.tile(np.eye(3), (len(p), 1, 1)), p), NOTE.format(world)
+    return Log(times, T, P, SAID | {"axes": "world"}, (note,), oriented=False, world=world)
 
 
 def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
@@ -67,9 +70,9 @@ def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
     if title is None:
         return None
     below = ((number, line) for number, line in lines.items() if number > title)
-    told = {number: line.split()[:10] for number, line in below if line[0] not in "(#%"}  # units
+    told = {number: line for number, line in below if line[0] != "("}  # units
     expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
-    values = rows_of(path, told, 10, expected)
+    values = table_of(path, told, "positions", expected).numbers(expected, range(10))
     north, east = (_degrees(values[:, k : k + 3]) for k in (3, 6))
     times = GPS_EPOCH + WEEK * values[:, 1] + values[:, 2]
     found = np.radians(north), np.radians(east), values[:, 9]
@@ -91,4 +94,4 @@ def _log(times: Times, north: Times, east: Times, height: Times, P: np.ndarray) 
     along = (radius + height) * cn
     p = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
     T = transforms(np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0)), p)
-    return Log(times, T, P, SAID, (NOTE,), oriented=False, world="ECEF")
+    return Log(times, T, P, SAID, (NOTE.format(ENU),), oriented=False, world="ECEF")

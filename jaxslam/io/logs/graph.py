@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.io.logs.log import Log, log, planar
-from jaxslam.io.text import Table, rows_of
+from jaxslam.io.text import table_of
 
 _SPATIAL, _PLANAR = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 NOTE = (
@@ -24,11 +24,11 @@ def read(path: Path, lines: Mapping[int, str]) -> Log | None:
     if kind is None:
         return None
     count = 8 if kind == _SPATIAL else 4
-    words = {number: line.split() for number, line in lines.items()}
-    told = {number: own for number, (first, *own) in words.items() if first == kind}
-    values = rows_of(path, told, count, f"{kind}, a number, and {count - 1} finite numbers")
-    order = np.argsort(values[:, 0], kind="stable")
-    values = values[order]
-    table = Table(path, (), (), values, tuple(np.array(list(told))[order].tolist()), {})
+    told = {n: line.removeprefix(kind) for n, line in lines.items() if line.startswith(kind)}
+    row = f"{kind}, a number, and {count - 1} finite numbers"
+    table = table_of(path, told, "vertices", row)
+    values = table.numbers(row, range(count), spare=False)
     found = planar(table, values, "s") if kind == _PLANAR else log(table, values, unit="s")
-    return found._replace(notes=(NOTE,), stamped=False)
+    order = np.argsort(found.times, kind="stable")
+    times, poses = found.times[order], found.poses[order]
+    return found._replace(times=times, poses=poses, notes=(NOTE,), stamped=False)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.text import Table
+from jaxslam.io.text import Table, without_values
 from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -22,6 +22,8 @@ MIXED = {"error": "split", "axes": "mixed"}
 WHOLE = "a covariance of finite numbers, or of NaN alone (an unknown axis has the variance −1)"
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
+_SINCE = (1e8, 4e9)
+"""Seconds since 1970, or since the epoch of GPS, of our time."""
 
 
 Words = Mapping[str, str]
@@ -71,7 +73,7 @@ def log(
     if not oriented:
         turns = np.where(np.isnan(rows[:, 1:2]), np.nan, [0.0, 0.0, 0.0, 1.0])
         rows = np.column_stack([rows, turns])
-    there = np.flatnonzero(~np.isnan(rows[:, 1:]).all(axis=1))
+    there = np.flatnonzero(~without_values(rows))
     T = np.full((len(rows), 4, 4), np.nan)
     T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
     P = np.empty((0, 6, 6)) if P is None else P
@@ -111,15 +113,18 @@ def unit_in(title: str) -> str:
 
 
 def unit_of(times: Times) -> str | None:
-    """The only unit of time in which they are `STEPS` apart; None where there is none, or two."""
+    """The only unit of `units_of`; None where there is none, or two."""
     fit = units_of(times)
     return fit[0] if len(fit) == 1 else None
 
 
 def units_of(times: Times) -> list[str]:
-    """The units of time in which they are `STEPS` apart."""
-    step = _step(times)
-    return [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+    """The units of time in which they are `STEPS` apart, of those the ones in which they are of our
+    time; or where they are `STEPS` apart in none, the latter."""
+    step, last = _step(times), float(np.abs(times).max())
+    near = [unit for unit, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+    ours = [unit for unit, scale in UNITS.items() if _SINCE[0] < last * scale < _SINCE[1]]
+    return [unit for unit in near if unit in ours] or near or ours
 
 
 def _step(times: Times) -> float:
@@ -132,12 +137,8 @@ def check_seconds(what: str, times: Times) -> None:
     # Seconds between two poses, more than a moving thing has.
     if last <= _LATEST and step <= 1e3:
         return
-    told = f"{step:.3g} from one to the next"
+    told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
     units = [NAMES[unit] for unit in units_of(times)] or ["another unit"]
-    if last > _LATEST:
-        told = f"up to {last:.3g}"
-        sizes = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
-        units = [next(unit for least, unit in sizes if last >= least)]
     ask = "; a title such as t_us says which" if len(units) > 1 else ""
     raise ValueError(f"{what}: times {told} look like {' or '.join(units)}; expected seconds{ask}")
 

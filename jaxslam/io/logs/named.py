@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.io.logs.log import (
     MIXED,
     NOTHING,
@@ -23,13 +24,13 @@ from jaxslam.io.text import Table
 _PLACES = ("", "p", "t", "pos", "position", "trans", "translation", "field", "msg", "pose",
            "transform", "point", "r")  # fmt: skip
 _TURNS = ("q", "quat", "quaternion", "orientation", "rotation", "rot", "att", "attitude")
-_PLACED = {"x": "x", "y": "y", "z": "z", "east": "x", "north": "y", "up": "z"}
+_PLACED = dict(zip(("x", "y", "z", "east", "north", "up", *"012"), 3 * "xyz", strict=True))
 _TURNED = dict(zip("xyzwijk0123", "xyzwxyzwxyz", strict=True))
 _ANGLES = {**dict.fromkeys(("θ", "theta", "yaw", "heading", "th", "psi"), "θ"),
            "roll": "roll", "phi": "roll", "pitch": "pitch"}  # fmt: skip
 _OTHERS = {"twist", "vel", "velocity", "linear", "angular", "acc", "acceleration", "bias"}
 _TIME = re.compile(
-    r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?)"
+    r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?|timestamp_sample)"
     r"|(?:(?:utc|gps|ros)_?)?(?P<t>t|ts|time|timestamps?|secs?|seconds)(?:_?[num]?s(?:ecs?)?)?"
 )
 _AXIS = r"roll|pitch|yaw|heading|phi|theta|psi|th|θ|r_?[xyz]|[xyzrpth]"
@@ -117,13 +118,15 @@ def _of_pose(told: str, turns: Collection[str]) -> str:
     for word, axis in ((before[-1] if before else "", last), (last[:-1], last[-1:])):
         if word in turns and axis in _TURNED:
             return f"q{_TURNED[axis]}"
-        if word in _PLACES and axis in _PLACED:
+        if word in _PLACES and axis in _PLACED and (word or not axis.isdigit()):
             return _PLACED[axis]
     return _ANGLES.get(last, "")
 
 
 def _spread(told: str) -> re.Match[str] | None:
     """A title as that of a σ, of a variance, or of a number of a covariance."""
+    told = re.sub(r"^((?:.*_)?(?:pos|position|ori|orientation)_(?!c).*_)([012])$",
+                  lambda x: x[1] + "xyz"[int(x[2])], told)  # fmt: skip
     told = re.sub(r"(?:^|_)(?:rot|rotation|ori|orientation|att|attitude)_(.*_)?([xyz])$",
                   r"_\1r\2", told).strip("_")  # fmt: skip
     told = re.sub(r"_(?:p|pos|position|trans|translation)_([xyz])$", r"_\1", told)
@@ -151,7 +154,8 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
         if flat and max(place) < 5:  # of x, y and yaw
             place = [5 if x > 1 else x for x in place]
         unit = _radians(table.titles[i]) if len(names) == 1 else 1.0
-        cells[place[0], place[-1]] = (table.rows[:, i] * unit) ** (2 if found["sigma"] else 1)
+        column = unit * np.clip(table.rows[:, i], -LARGEST, LARGEST)  # whose square is finite
+        cells[place[0], place[-1]] = column ** (2 if found["sigma"] else 1)
         if {"roll", "pitch"} & {*names}:
             axes = {"error": "split", "axes": "rpy"}
         axes = _ROS if found["cov"] and not names else axes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxslam.io.logs.log import Log, log, symmetric_or_none
+from jaxslam.io.logs.log import NAMES, Log, log, symmetric_or_none
 from jaxslam.io.text import Table
 
 _KNOWN = {
@@ -13,9 +13,7 @@ _KNOWN = {
         "translation_rotation": "position-first", "rotation_translation": "rotation-first",
     },
     "ROTATION_PARAM": {"axis_angle": "axis_angle"},
-    "TIMESTAMP_UNIT": {
-        "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns",
-    },
+    "TIMESTAMP_UNIT": {name: unit for unit, name in reversed(NAMES.items())},
 }  # fmt: skip
 """The values of its headers that are read, and what they are here; the first is the default."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from jaxslam.io.logs import named
 from jaxslam.io.logs.log import MIXED, NOTHING, Log, log, planar, symmetric, symmetric_or_none
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, transforms
@@ -105,18 +106,30 @@ def _w_first(table: Table) -> Log | None:
     return found._replace(notes=(*found.notes, note))
 
 
+_STAMPED = {7: "t x y z roll pitch yaw", 9: "sec nsec x y z qx qy qz qw"}
+_STAMPED[45] = _STAMPED[87] = f"{_STAMPED[9]} {' '.join(f'covariance{i}' for i in range(36))}"
+"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist."""
+
+
+def _as_titled(table: Table) -> Log | None:
+    """Lines of these numbers, and maybe of frames, by their titles."""
+    rows = np.delete(table.rows, [*table.words], axis=1)
+    titles = tuple(_STAMPED.get(rows.shape[1], "").split())
+    whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.hypot.reduce(rows[:, 3:7], axis=1)
+    # No whole seconds and nanoseconds; or a quaternion, without a time.
+    if (np.abs(turn - 1) < _LENGTH).all() if len(titles) == 7 else not whole.all():
+        return None
+    return named.read(table._replace(titles=titles, rows=rows, words={}))
+
+
 def _positions(table: Table) -> Log:
     """Positions alone, with the triangle of their covariance: no orientation."""
     rows = table.numbers("10 finite numbers t x y z and the upper triangle of their covariance")
     return log(table, rows[:, :4], symmetric(rows[:, 4:], UPPER), MIXED)
 
 
-def without_values(rows: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
-    """A mask of the rows that have a time and NaN."""
-    return np.asarray(np.isnan(rows[:, 1:]).all(axis=1))
-
-
 FORMATS: tuple[tuple[str, Reader], ...] = (
+    ("sec nsec x y z qx qy qz qw and maybe ROS' covariance; t x y z roll pitch yaw", _as_titled),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
     ("TUM, 8 numbers", _of(8, _tum)),
     ("t x y θ", _of(4, _planar)),
