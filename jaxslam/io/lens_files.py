@@ -160,8 +160,7 @@ def lens(names: Sequence[str], distortion: Sequence[float]) -> tuple[str, tuple[
     most = 4 if model == "fisheye" else 8
     atan = model == "fisheye" and 0 < len(told) < 4  # SVO's, of one number
     if not set(words) <= _MODELS.keys() or any(told[most:]) or atan:
-        which = " ".join(names) or "no name"
-        which += f" of {len(told)} numbers" * bool(told)
+        which = (" ".join(names) or "no name") + f" of {len(told)} numbers" * bool(told)
         raise ValueError(
             f"unknown lens, {which}; expected plumb_bob (radtan), "
             "rational_polynomial (8 numbers) or equidistant (fisheye); undistort the pictures, or "

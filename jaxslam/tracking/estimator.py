@@ -259,7 +259,8 @@ class Estimator:
         return model.calibration.name, mean, covariance
 
     def biases(self, state: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """Return the biases of gyroscope, rad/s, and accelerometer, m/s², and their σ."""
+        """Return the biases of gyroscope, rad/s, and accelerometer, m/s², and, where it is
+        estimated, by how much the unit's clock is ahead beside what is known, s; and their σ."""
         mean, covariance = jax.device_get(_biases(self.slam, state))
         return mean, np.sqrt(np.diagonal(covariance))
 
@@ -486,7 +487,7 @@ def _intrinsics(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Arr
 
 @Program
 def _biases(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Array]:
-    return slam.marginal(state, lambda view: view.core.motion.bias)
+    return slam.marginal(state, lambda x: jnp.append(x.core.motion.bias, x.core.motion.clock))
 
 
 @Program

@@ -99,8 +99,10 @@ def summarised(
         summary["inertial"] = {
             "readings": inertial.log.name,
             "start": inertial.why_moving or "at rest",
-            "biases": biases.tolist(),
-            "biases_sigma": sigma.tolist(),
+            "biases": biases[:6].tolist(),
+            "biases_sigma": sigma[:6].tolist(),
+            "clock_offset": (biases[6:] + inertial.clock_offset).tolist(),  # none where known
+            "clock_offset_sigma": sigma[6:].tolist(),
         }
         with suppress(ValueError):
             trajectories = *trajectory_of(history), *(source.reference or ([], []))
@@ -220,20 +222,16 @@ def reference_in_map(source: Source, history: History) -> np.ndarray | None:
 def _units(history: History) -> list[Summary]:
     """Return, for every map, the frame from which on the filter's unit was fixed, and the log of
     the map's unit in metres as believed at its end, with σ; null where there is no doubt."""
-    units = []
-    for number in sorted({result.map for result in history}):
-        of_map = [result for result in history if result.map == number]
-        fixed = (result.index for result in of_map if result.unit_fixed)
-        last = of_map[-1]
-        units.append(
-            {
-                "map": number,
-                "fixed_at": next(fixed, None),
-                "log_scale": last.log_scale,
-                "sigma_log_scale": last.sigma_log_scale,
-            }
-        )
-    return units
+    return [
+        {
+            "map": number,
+            "fixed_at": next((result.index for result in of if result.unit_fixed), None),
+            "log_scale": of[-1].log_scale,
+            "sigma_log_scale": of[-1].sigma_log_scale,
+        }
+        for number in sorted({result.map for result in history})
+        for of in [[result for result in history if result.map == number]]
+    ]
 
 
 def _unit_line(unit: Summary) -> str:

@@ -363,7 +363,8 @@ class Tracker:
 
     def biases(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the biases of an inertial unit, gyroscope (rad/s) before accelerometer (m/s²), and
-        their σ."""
+        how much its clock is ahead (s), beside what is known, where that is estimated; and their
+        σ."""
         with jax.enable_x64(True):
             return self.estimator.biases(self.state.map.state)
 

@@ -16,7 +16,7 @@ from jaxslam.cli.track import TrackOptions
 from jaxslam.io.calibration import write_calibration
 from jaxslam.io.tum import write_tum
 from jaxslam.models.imu import Increments
-from jaxslam.tracking.inertial import Inertial
+from jaxslam.tracking.inertial import CLOCK_SIGMA, Inertial
 from jaxslam.tracking.moving_start import begun
 from jaxslam.tracking.settings import INERTIAL, TrackerSettings
 from jaxslam.tracking.tracker import Tracker
@@ -159,6 +159,9 @@ def test_the_command_tracks_with_the_readings_of_a_folder(short, folder, tmp_pat
     assert (unit["readings"], unit["start"]) == (str(folder / "imu.csv"), "at rest")
     off = (np.asarray(unit["biases"]) - short.bias) / unit["biases_sigma"]
     assert np.abs(off).max() < 4
+    # The files state no offset, and there is none.
+    assert 0 < unit["clock_offset_sigma"][0] < CLOCK_SIGMA
+    assert abs(unit["clock_offset"][0]) < 4 * unit["clock_offset_sigma"][0]
     assert "length=m" in (tmp_path / "covariance.txt").read_text().splitlines()[0]
     assert summary["ate_metres"]["alignment"] == "se3"
     assert summary["ate_metres"]["rmse"] < 0.02 * summary["ate_metres"]["path_length"]
