@@ -21,7 +21,7 @@ from jaxslam.simulation.scenario import parse_override
 
 @dataclass(frozen=True)
 class ConsistencyOptions:
-    """Simulate many runs of filters, and test whether they are consistent."""
+    """Simulate many runs of filters: are they consistent?"""  # noqa: D400
 
     scenario: Annotated[
         str,

@@ -23,7 +23,7 @@ from jaxslam.triangulation import (
 
 @dataclass(frozen=True)
 class TriangulateOptions:
-    """Show how well two views determine a depth, and whether the estimate is consistent."""
+    """How well do two views determine a depth, and is the estimate consistent?"""  # noqa: D400
 
     depth: float = TwoViews.depth
     """True depth of the point, m."""
