@@ -182,7 +182,8 @@ class Imu(AbstractMotion):
     mount_sigma: Float[AnyArray, " m"] = number_field(default=())
     """σ of its position, m, and rotation, rad, about the unit's axes, where they are estimated."""
     clock_sigma: Float[AnyArray, " c"] = number_field(default=())
-    """σ of the offset between the clocks of unit and camera, s, where it is estimated."""
+    """σ of the offset between the clocks of unit and camera, s, where it is estimated; simulations
+    have no offset."""
     gravity: Number = number_field(default=9.81)
     """m/s²."""
     readings: int = eqx.field(static=True, default=40)
