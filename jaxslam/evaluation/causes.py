@@ -355,7 +355,7 @@ def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
         off = np.log([part.axis_verdict(i)["sigma_factor"] or np.inf for i in range(len(names))])
         # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
         certain &= bool(abs(off.mean()) <= np.log(HALF) and np.ptp(off) <= 3 * np.log(HALF))
-    if not explained(fixed) or not (certain or explained(fixed)):
+    if not explained(fixed):
         return None
     return Mistake(
         "half angles" if certain else "the covariances may be of half angles",

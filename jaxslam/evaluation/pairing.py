@@ -29,6 +29,7 @@ from jaxslam.evaluation.inputs import exactly_known, without_unknown
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
 from jaxslam.io.logs.frames import read_frames
+from jaxslam.io.logs.geodetic import GPS_EPOCH, WEEK
 from jaxslam.io.logs.log import Log, check_seconds, interpolated
 from jaxslam.io.tum import Times
 
@@ -43,9 +44,8 @@ SPARSE = 3.0
 """The number of poses to every true one from which the estimate is taken at the truth's stamps."""
 ROUNDED = 1e-4
 """The share of the time between two poses by which stamps that are rounded are others."""
-LEAPS, GPS_EPOCH, WEEK, HALF_HOUR = 18.0, 315964800.0, 604800.0, 1800.0
-"""Seconds from UTC to GPS time since 2017, from the epoch of Unix to that of GPS, of a week, and
-between the clocks of two zones."""
+LEAPS, HALF_HOUR = 18.0, 1800.0
+"""Seconds from UTC to GPS time since 2017, and between the clocks of two zones."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 _SAME = Convention("split", "mixed")
 

@@ -49,17 +49,12 @@ class InertialWindow(eqx.Module):
     def size(self) -> int:
         """The number of unknowns."""
         frames, m, _ = self.pixels.shape
-        return self.of_start + 18 * (frames - 1) + 3 * m
-
-    @property
-    def of_start(self) -> int:
-        """Those of the start, the first."""
-        return len(self.imu.start()[1])
+        return len(self.imu.start()[1]) + 18 * (frames - 1) + 3 * m
 
     def path(self, x: Float[Array, " n"]) -> tuple[Pose, InertialState]:
         """The cameras after every step, in the first one, and the variables at the end."""
         mean, root = self.imu.start()
-        steps, k = len(self.pixels) - 1, self.of_start
+        steps, k = len(self.pixels) - 1, len(root)
         noise = x[k : k + 18 * steps].reshape(steps, 18) * self.imu.noise_sigma
 
         def move(carry, step):
