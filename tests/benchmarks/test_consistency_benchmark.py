@@ -103,31 +103,6 @@ def test_seeds_that_are_there_are_not_measured_again(options, monkeypatch):
         dataclasses.replace(options, runs=20)()
 
 
-def test_a_row_says_what_was_lost_what_decided_and_which_means_are_in_the_band():
-    nees = np.random.default_rng(1).chisquare(3, (1000, 12))
-    nees[:, 4:] *= 1.2  # from step 5
-    nees[:20, 9:] = 100.0  # from step 10
-    row = benchmark._row("x/y", measured(nees, 4))
-    assert row[:3] == ["`x/y`", "3.85", "1.13 [1.09, 1.19]"]
-    assert row[3].startswith("over-confident")
-    assert all(float(value) > 3.3 for value in row[5].split())
-    assert row[6] == "2.00%; 2.10%"
-    nees[:, 4] /= 1.2
-    assert benchmark._row("x/y", measured(nees, 4))[5].startswith("**")
-    nees = np.random.default_rng(3).chisquare(3, (300, 12))
-    nees[:, -1] *= 1.4
-    assert benchmark._row("x/y", measured(nees))[3] == "over-confident (last step)"
-
-
-def test_rows_tallied_without_thirds_have_a_verdict_and_a_mark():
-    found = measured(np.random.default_rng(4).chisquare(3, (300, 12)))
-    old = {k: v for k, v in found.items() if k not in ("one_scale", "drift")}
-    old["tally"] = {k: v for k, v in found["tally"].items() if k != "thirds"}
-    assert benchmark.verdicts_of(old)["tally"]["thirds"] == []
-    assert benchmark._row(NAME, old)[::4] == ["`robocentric` †", "–"]
-    assert benchmark._row(NAME, found)[0] == "`robocentric`"
-
-
 def test_a_diverged_run_leaves_a_row_without_a_mean():
     nees = np.random.default_rng(2).chisquare(3, (50, 12))
     broken = nees.copy()
@@ -135,15 +110,3 @@ def test_a_diverged_run_leaves_a_row_without_a_mean():
     row = benchmark._row("x/y", measured(nees) | {"tally": Tally.of(broken, 3).asdict()})
     assert row[1:4] == ["–", "–", "lost"]
     assert "**" not in "".join(row)
-
-
-@pytest.mark.parametrize(
-    ("name", "short"),
-    [
-        ("scale_gauge+oc+scene50+walk3+mixture17/inverse_scaling", "recommended"),
-        ("scale_gauge+mixture17/inverse_scaling", "+mixture17"),
-        ("world/cartesian", "world/cartesian"),
-    ],
-)
-def test_filters_have_short_names_in_tables(name, short):
-    assert benchmark.label(name) == short

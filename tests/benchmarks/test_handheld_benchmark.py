@@ -1,7 +1,6 @@
 """Tests of benchmarks/handheld.py: its numbers are those of its runs, and measured only once."""
 
 import json
-from typing import Any
 
 import handheld as benchmark
 import numpy as np
@@ -55,18 +54,6 @@ def test_numbers_are_those_of_the_runs():
     assert found["reversed"] == [None, pytest.approx(4 / 49), pytest.approx(4 / 49)]
     assert found["nis"] == pytest.approx(0.9)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-
-
-def test_the_table_has_a_row_for_every_path():
-    found: dict[str, Any] = {"runs": 50, "steps": 40, **benchmark.numbers(records())}
-    told = benchmark.as_table({"handheld-a": {"one": found}, "tracks-b": {"one": found}})
-    assert told.startswith("`one`, 50 runs of 40 steps (simulated), 50 runs of 40 steps (tracks):")
-    rows = [line.split(" | ") for line in told.splitlines() if line.startswith("| ")][1:]
-    assert [row[0] for row in rows] == ["| a", "| tracks-b"]
-    one, median = found["one_scale"][-1], found["one_scale_median"]
-    assert rows[0][1] == f"{one:.2f}; {median[-1]:.2f}"
-    assert rows[0][2] == f"{median[0]:.2f} {median[1]:.2f}"
-    assert (rows[0][3], rows[0][-1]) == ("4%", "0.90 |")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-import rendered
 import rendered_videos as benchmark
 from numpy.testing import assert_allclose
 from rendered_videos import Body, Paint, render
@@ -107,10 +106,3 @@ def test_cameras_move_as_their_kinds_say():
 def test_unknown_kinds_and_modifiers_are_refused():
     with pytest.raises(ValueError, match=r"boxes, orbit, .* are accepted"):
         benchmark.rendered_source("orbit+fog", 0)
-
-
-def test_a_kind_of_which_one_video_differs_shows_the_range():
-    one = {"frames": 100.0, "tracked": 100.0, "maps": 1.0, "error": 0.001, "beyond_scale": 0.5}
-    other = one | {"tracked": 90.0, "error": 0.02, "lies": 0.031}
-    row = rendered.as_table({"turn+blur": {"0": one, "1": other}}).splitlines()[-1]
-    assert row.startswith("| turn + blur | 2 | 10%; 1 | – | – | 0.10–2.00 % | – | 0.5 | 3 % | – |")
