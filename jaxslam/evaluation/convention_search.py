@@ -229,8 +229,7 @@ def _distinguished(other: Tried, best: Tried) -> bool:
     if _worse(other.nees, best.nees):
         return True
     own, least = (np.nanmean(x.nees, axis=1) for x in (other, best))
-    noticed = 0 < (1 + NOTICEABLE) * np.mean(least) <= np.mean(own)
-    if not noticed or not 2 <= len(own) <= FEW:
+    if not (np.mean(least) > 0 and 2 <= len(own) <= FEW):
         return False
     ratio = (best.dof - best.fitted) / 2 * len(own) * np.log(np.mean(own) / np.mean(least))
     in_most = np.mean(own > least) > 0.5  # not for one run that was lost

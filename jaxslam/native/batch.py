@@ -116,9 +116,7 @@ def _kind(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(np.shape(x), x.dtype)
 
 
-def _kinds(
-    tree: PyTree,
-) -> tuple[jax.tree_util.PyTreeDef, tuple[tuple[tuple[int, ...], np.dtype], ...]]:
+def _kinds(tree: PyTree) -> Kinds:
     leaves, structure = jax.tree.flatten(tree)
     return structure, tuple((np.shape(x), np.dtype(x.dtype)) for x in leaves)
 

@@ -11,7 +11,8 @@ import pytest
 
 import jaxslam
 from jaxslam.consistency import draw, fit_of, log_likelihood, of_simulation
-from jaxslam.consistency.tuning import NOISE, TuningSettings, _Search
+from jaxslam.consistency.tuning import NOISE, TuningSettings, _outliers, _records, _Search
+from jaxslam.models.observations import Features, Innovation
 
 MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
 SENSOR = jaxslam.RangeBearing([0.1, 0.02])
@@ -94,6 +95,18 @@ def test_a_sigma_of_zero_stays_bounds_hold_and_a_prior_costs():
     # Half of a factor of two is one σ of the prior.
     cost = search.prior_cost(search.first)
     assert cost == pytest.approx(0.5 + (np.log(0.02) / np.log(2)) ** 2 / 2, rel=1e-3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_number_that_is_left_out_costs_as_one_of_so_many_sigma():
+    """`½ (outlier² + log det S / dof)`: two of three landmarks are used, of two numbers each."""
+    used, numbers = jnp.array([True, True, False]), jnp.zeros((3, 2))
+    nis, status, log_det = jnp.asarray(5.0), jnp.asarray(0), jnp.asarray(-8.0)
+    innovation = Innovation(numbers, numbers, None, used, nis, status, log_det)
+    seen = Features(jnp.arange(3), numbers, jnp.ones(3, bool))
+    found = _records(innovation, jaxslam.Frames(None, seen, seen))
+    assert (found.cost, found.log_det, found.nis, found.dof, found.left_out) == (-1.5, -8, 5, 4, 2)
+    assert _outliers(found, TuningSettings(outlier=3.0)) == ((9 - 8 / 4) / 2, 6.0)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -324,8 +324,11 @@ def test_a_drift_of_scale_is_over_confident_and_named():
     axes = plot_scale(replace(found, scale=steady), ax=new_figure(4, 3).subplots())
     low, high = axes.get_ylim()  # what is claimed is shown where no scale drifts
     assert plot_axis(found, 0, ax=new_figure(4, 3).subplots()).get_ylabel() == "map units"
-    claimed = [np.nanmedian(np.abs(line.get_ydata())) for line in axes.lines[-2:]]
-    assert low < -max(claimed) < max(claimed) < high
+    claimed = np.array([line.get_ydata() for line in axes.lines[-2:]])
+    sigma = np.nanmedian(found.scale.sigma[:, -1])
+    np.testing.assert_allclose(claimed[:, -1], 100 * np.expm1([-2 * sigma, 2 * sigma]))
+    assert low < -np.nanmedian(abs(claimed), axis=1).max()
+    assert np.nanmedian(abs(claimed), axis=1).max() < high
 
 
 @pytest.mark.parametrize(("factor", "disproved"), [(0.3, False), (3.0, True)])

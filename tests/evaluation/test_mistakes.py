@@ -62,6 +62,7 @@ def test_an_angle_that_is_not_wrapped_is_named(names, turns):
     e, P = right()
     e[5, 7, 2] += turns * 2 * np.pi
     assert "an angle is not wrapped" in said(e, P, names)
+    assert " more" not in jaxslam.evaluate(e, P, names=names).mistakes[0].told
     assert "an angle is not wrapped" in said(e[5:6], P[5:6], names)
     assert "(1)" in said(e[..., 2:], P[..., 2:, 2:], ())
 

@@ -212,6 +212,26 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change):
     np.testing.assert_array_equal(one.used, [False, True, False])
 
 
+def test_an_iterated_update_is_so_many_steps_of_gauss_newton():
+    """`x ← x₀ + K (z − h(x) − H (x₀ − x))`, of a camera whose pose is known: the rest is linear."""
+    state, _, dense, jacobian = planar_case()
+    steps, x, known = 2, np.zeros(len(state.covariance)), np.arange(len(state.covariance)) < 3
+    P = np.where(known | known[:, None], 0.0, state.covariance)
+    pixels = dense(state, x)[:3] + np.array([50.0, -30.0, 80.0])
+    model, context = slam_model(PLANAR, InverseScaling(), Robocentric()), Context(jnp.asarray(STEP))
+    seen = Features(jnp.arange(3), pixels[:, None], jnp.ones(3, bool))
+    given = replace(state, covariance=jnp.asarray(P)), seen, noise_of(PLANAR), context
+    after, _ = quick_jit(partial(Kalman(steps).update, model))(*given)
+    for _ in range(steps):
+        H = np.asarray(jacobian(state, x))[:3]
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 0.09 * np.eye(3))
+        before, x = x, K @ (pixels - dense(state, x)[:3] + H @ x)
+    assert np.abs(x - before).max() > 1e-4  # one step fewer, or more, is another state
+    c, left = state.core_dim, np.eye(len(P)) - K @ H
+    close(after.landmarks.ravel(), state.landmarks.ravel() + x[c:], 1e-9)
+    close(after.covariance, left @ P @ left.T + 0.09 * K @ K.T, 1e-9)
+
+
 @pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
 def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
     """P ← J diag(P, R, σ², R, σ²) Jᵀ for two landmarks at once, the paper's P22–P26."""

@@ -270,5 +270,7 @@ def test_a_world_is_shown(tmp_path):
     lines = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["beacon, as surveyed"]) == 3
     assert len(lines["measured"]) + len(lines["never measured"]) == 6
-    run = simulated(scenario("handheld", steps=2, landmarks=5))
-    assert scenario("handheld", steps=2, landmarks=5).plot(run).axes
+    world = scenario("handheld", steps=2, landmarks=5)
+    run = simulated(world)
+    (path,) = (x for x in world.plot(run).axes[0].get_lines() if x.get_label() == "true path")
+    np.testing.assert_array_equal(path.get_xydata(), run.poses.translation()[:, [0, 2]])
