@@ -357,7 +357,7 @@ def _convention_of(logs: list[RunLogs], stated: dict[str, str]) -> Convention:
     said = {one.files.of_covariances: one.estimate.said for one in logs}
     (first, of_first), *others = said.items()
     for place, own in others:
-        if own != of_first:
+        if Convention(**own) != Convention(**of_first):
             raise ValueError(
                 f"{place} states a different convention ({Convention(**own)}) from {first} "
                 f"({Convention(**of_first)})"

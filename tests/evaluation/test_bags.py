@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import refusals
 from bags import ros_of, write_bag
-from logs import ESTIMATE, TIMES, TRUTH, in_space, in_the_world
+from logs import ESTIMATE, TIMES, TRUTH, in_space, in_the_world, joined
 from logs import P as MIXED
 from recordings import write as write_path
 
@@ -106,6 +106,9 @@ def test_topics_are_listed_where_none_or_several_fit(tmp_path):
     refused(r"fit --estimate /e; .*/e \(nav_msgs/Odometry, 0 messages\)", bag, estimate="/e")
     refused(r"fit --truth /x; .*PoseStamped", bag, estimate="/a", truth="/x")
     refused(r"a bag has its own covariances", bag, covariance=tmp_path / "covariance.txt")
+    tree = write_bag(tmp_path / "tree.mcap", {"/odom": odometry(r), **joined(r)})
+    refused(r"Transforms of /tf have no covariance; they can be the truth", tree, estimate="/x")
+    refused(r"name the pose as /tf:PARENT\.CHILD, of frames that are", tree, truth="/tf:map.x")
     one = write_bag(tmp_path / "one.bag", {"/odom": odometry(ros_of("one.bag"))})
     refused(r"one\.bag: no other topics fit --truth; name one .*; there are /odom \(", one)
     np.savez(tmp_path / "runs.npz", errors=np.zeros((1, 2, 3)), sigmas=np.ones((1, 2, 3)))

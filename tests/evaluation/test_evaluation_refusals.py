@@ -51,6 +51,7 @@ OF_ARRAYS = [
     (spoilt_P((3, 4, 0, 1), 9.0), r"run 3, step 4 is not symmetric .*it must be symmetric and pos"),
     (spoilt_P((6, 5), 2.0 - np.eye(3)), "run 6, step 5 has an eigenvalue"),
     (spoilt_P((6, 5), 0.0), "run 6, step 5 "),
+    (spoilt_P((6, 5), np.where(np.eye(3) > 0, 1e-308, 1e308)), "1e.308 where its variances allow"),
     (arrays(E[:0], P[:0]), r"errors must be an array .*, not \(0, 7, 3\)"),
     (arrays("many"), "errors must be numbers"),
     (arrays(E.astype(complex)), "errors must be numbers"),
@@ -70,6 +71,7 @@ OF_ARRAYS = [
     (lambda: Convention(scale="free"), "unknown scale"),
     (poses(changed(T, (1, 2, 0, 0), 9.0)), "estimates of run 1, step 2 is not a rigid motion"),
     (poses(truth=TRUTH[:2]), r"truths must have the same shape, not \(2, 6, 4, 4\)"),
+    (poses(P=np.full((3, 36, 36), 1e300)), r"covariances of run 0 hold numbers .*beyond 1e\+100"),
     (poses(P=POSE_P[..., :3, :3]), r"must be \(3, 6, 6, 6\), or the joint ones"),
     (poses(truth=changed(TRUTH, (0, 0, 0, 3), 1e300), align="se3"),
      r"truths contain 1e\+300; the limit is 1e\+100"),
@@ -252,7 +254,16 @@ def frames(old, new):
     return read
 
 
+def in_the_plane(folder):
+    for name, numbers in (("estimate", "1 2 0"), ("covariance", "1 1 1"), ("truth", "1 2 0")):
+        text = "".join(f"{t / 10} {numbers}\n" for t in range(6))
+        (folder / "run01" / f"{name}.txt").write_text(text)
+
+
 OF_FOLDERS = [
+    (two_runs(in_the_plane), ": planar and spatial runs cannot be mixed"),
+    (two_runs(lambda x: evaluate_log(x, covariance=x / "c.txt")), "needs its own covariance"),
+    (of_text("estimate.txt", "#%FORMAT SQUARE/0.3\n1 2 3\n"), "line 2: expected 29 numbers"),
     (another("run00/trajectory.txt"), r"run00 has both estimate\.txt and trajectory\.txt; keep"),
     (another("estimate.txt"), r"has a run and sub-folders with runs \(run00, run01\)"),
     (without("run01/truth.txt"), r"run01 has no truth\.txt"),

@@ -234,6 +234,7 @@ REFUSED = [
     ({"placement": "rays", "known_landmarks": 3}, "known_landmarks: placement rays has no"),
     ({"placement": "rays", "sensor": "position"}, "placement rays is for a camera"),
     ({"placement": "rays", "in_view": 5}, "in_view: not with placement rays"),
+    ({"placement": "rays", "beacons": 3}, "beacons: not with placement rays"),
     ({"known_landmarks": 3, "in_view": 5}, "in_view: not with known_landmarks"),
     ({"range": [5.0, 0.5]}, "range needs a least and a greatest one"),
     ({"range": 5.0}, "range needs 2 values"),

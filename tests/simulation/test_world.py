@@ -163,6 +163,7 @@ def test_pieces_that_make_no_world_are_refused(fields, message):
         ({"view": 3}, "view is an instance of FieldOfView, not 3"),
         ({"view": FieldOfView([0, math.inf])}, "view.range holds inf; it must be finite"),
         ({"depth": "near"}, "depth is an instance of InverseDepth, not 'near'"),
+        ({"treatment": "maybe"}, "calibration is 'maybe'; known: white"),
         ({"steps": 2.5}, "steps of World must be a whole number, not 2.5"),
         ({"beacons": "3"}, "beacons of World must be a whole number, not '3'"),
         ({"rate": [10.0]}, r"rate of World must be a number, not \[10.0\]"),
