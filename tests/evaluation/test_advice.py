@@ -63,6 +63,8 @@ def test_what_innovations_cannot_see_is_no_noise():
     P = np.tile(START, (RUNS, STEPS, 1, 1))
     shy = jaxslam.evaluate(0.5 * nees.errors, P)
     assert "NEES is too small all the same" in advice(nis, shy)
+    after = jaxslam.evaluate(0.5 * nis.errors, nis.sigmas[..., None] ** 2, quantity="NIS")
+    assert "these are no innovations of it; log z − h(x) before the update" in advice(after, nees)
 
 
 def test_white_innovations_of_few_steps_are_not_called_correlated():

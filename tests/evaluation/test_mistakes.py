@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import verdicts as benchmark
 from cases import quick_rows
+from scipy import stats
 
 import jaxslam
+from jaxslam.evaluation import evaluate_nees
 
 NAMES = ("x", "y", "heading")
 SIGMA, DEGREES = benchmark.AXIS_SIGMA, benchmark.UNITS
@@ -107,6 +109,17 @@ def test_where_all_of_sigma_is_too_small_it_is_not_the_unit_of_angles():
             e, P = right(runs=len(factor), seed=seed, correlation=0.9 if factor is lost else 0.0)
             assert 29 < jaxslam.evaluate(factor * e, P).axis_verdict(2)["sigma_factor"] < 115
             assert said(factor * e, P, names) == ""
+
+
+def test_a_gate_in_front_of_innovations_is_named():
+    """At a usual quantile of χ², and of so many NIS that none is beyond it by chance."""
+    nis, gate = np.random.default_rng(0).chisquare(2, (1, 4000)), stats.chi2.isf(0.05, 2)
+    behind = nis[nis < gate][None]
+    found = evaluate_nees(behind, 2, quantity="NIS")
+    assert found.headline == "no verdict: a gate in front of the NIS"
+    assert f"none of {behind.size} NIS is above 5.991, where 189 should be" in str(found)
+    for others in (nis, nis[nis < 1.2 * gate][None], behind[:, :100]):
+        assert "gate" not in evaluate_nees(others, 2, quantity="NIS").headline
 
 
 def test_positions_anywhere_are_no_angles():
