@@ -40,11 +40,7 @@ def _tum(table: Table) -> Log:
     return log(table, rows, P, MIXED if count == 20 else NOTHING)
 
 
-def _planar(table: Table) -> Log:
-    return planar(table, table.numbers("four finite numbers t x y θ (s, m, rad)"))
-
-
-_KITTI = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)"
+_KITTI, _PLANAR = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)", "four finite numbers t x y θ"
 
 
 def _kitti(table: Table) -> Log:
@@ -107,13 +103,19 @@ def _w_first(table: Table) -> Log | None:
 
 
 _STAMPED = {7: "t x y z roll pitch yaw", 9: "sec nsec x y z qx qy qz qw"}
+_STAMPED[17] = (
+    "sec nsec status service latitude longitude altitude "
+    f"{' '.join(f'position_covariance{i}' for i in range(9))} type"
+)
 _STAMPED[45] = _STAMPED[87] = f"{_STAMPED[9]} {' '.join(f'covariance{i}' for i in range(36))}"
-"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist."""
+"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist or of
+NavSatFix."""
 
 
 def _as_titled(table: Table) -> Log | None:
     """Lines of these numbers, and maybe of frames, by their titles."""
-    rows = np.delete(table.rows, [*table.words], axis=1)
+    blank = [2] if np.isnan(table.rows[:, 2:3]).all() else []  # a frame without a name
+    rows = np.delete(table.rows, [*table.words, *blank], axis=1)
     titles = tuple(_STAMPED.get(rows.shape[1], "").split())
     whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.hypot.reduce(rows[:, 3:7], axis=1)
     # No whole seconds and nanoseconds; or a quaternion, without a time.
@@ -131,12 +133,10 @@ def _positions(table: Table) -> Log:
 FORMATS: tuple[tuple[str, Reader], ...] = (
     ("sec nsec x y z qx qy qz qw and maybe ROS' covariance; t x y z roll pitch yaw", _as_titled),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
-    ("TUM, 8 numbers", _of(8, _tum)),
-    ("t x y θ", _of(4, _planar)),
+    ("TUM, 8 numbers", _of(8, _tum)), ("t x y θ", _of(4, lambda x: planar(x, x.numbers(_PLANAR)))),
     ("KITTI, 12 numbers", _of(12, _kitti)),
-    ("t x y z and a triangle, 10 numbers", _of(10, _positions)),
-    ("OpenVINS's states", _state),
+    ("t x y z and a triangle, 10 numbers", _of(10, _positions)), ("OpenVINS's states", _state),
     ("OpenVINS's pose_to_file, 20 numbers", _of(20, _tum)),
     ("TUM and a triangle, 29 numbers", _of(29, _tum)),
     ("TUM and a covariance, 44 numbers", _of(44, _tum)),
-)
+)  # fmt: skip
