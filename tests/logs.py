@@ -281,6 +281,17 @@ def kitti(timed):
     return write
 
 
+def matrices(columns):
+    """A time and all of T_wc, by rows or by columns; covariances by their stamps."""
+
+    def write(folder):
+        tum(folder)
+        for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
+            lines(folder / f"{name}.txt", TIMES, np.swapaxes(T, 1, 2) if columns else T)
+
+    return write
+
+
 def of_planes(values):
     def write(folder):
         lines(folder / "estimate.txt", TIMES, FLAT)
@@ -754,6 +765,8 @@ LOGS = {
         evaluate_poses, *(np.array(x) for x in ([ESTIMATE, OTHER], [P, P], [TRUTH, TRUTH])),
         Convention(**MIXED),
     )),
+    "matrices of ARKit": Log(matrices(columns=True)),
+    "matrices with a time": Log(matrices(columns=False)),
     "KITTI": Log(kitti(timed=False)),
     "KITTI, timed": Log(kitti(timed=True)),
     "plane, triangle": Log(of_planes(FLAT_P[:, *UPPER3]), IN_THE_PLANE),

@@ -36,8 +36,6 @@ MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
-SMALL = 0.5
-"""The largest σ by the error of a first pose, of the median of all, at which runs are aligned."""
 
 
 class Similarity(NamedTuple):
@@ -356,7 +354,7 @@ def _small_at_first(poses: Poses) -> bool:
                 np.diagonal(x, axis1=1, axis2=2)[:, part].max(axis=1)
                 for x in (moved, run.covariances)
             )
-            if np.median(variance) > SMALL**2 * np.median(own):
+            if np.median(variance) > 0.5**2 * np.median(own):  # half of σ
                 return False
     return True
 

@@ -148,8 +148,6 @@ def _evaluate_arrays(
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt", "traj_estimate.txt")
 COVARIANCES = ("covariance.txt", "state_deviation.txt")
 TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt", "reference.txt", "ref.txt")
-LOOKED_AT = 10
-"""The most runs whose clocks are looked at."""
 TEXTS = (".txt", ".csv", ".tum", ".pos", ".smfeval", ".dat", ".g2o")
 """Endings of a file of these names; what it is says its content."""
 
@@ -308,7 +306,7 @@ def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
 
 def _offset(logs: list[RunLogs]) -> Offset | None:
     """The median offset of the runs' clocks, by their σ; None where rotations do not tell it."""
-    told = (one.offset for one in logs[:LOOKED_AT])
+    told = (one.offset for one in logs[:10])  # more would say no more
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None

@@ -36,8 +36,6 @@ from jaxslam.io.tum import Times
 Place: TypeAlias = Path | ros.Topic
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
-BACK = 0.01
-"""The largest share of stamps that may go back in time, and are then left out."""
 DENSE = 0.3
 """The largest error of interpolation, in σ of the estimate, of a truth that is interpolated."""
 SPARSE = 3.0
@@ -114,7 +112,7 @@ def read(place: Place) -> Log:
 
 def _in_order(place: Place, log: Log) -> Log:
     back = log.times < np.maximum.accumulate(log.times)
-    if 0 < back.sum() <= BACK * len(back):
+    if 0 < back.sum() <= 0.01 * len(back):  # more are no accident
         log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
     last = np.append(np.diff(log.times) > 0, True)

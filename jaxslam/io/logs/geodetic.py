@@ -73,14 +73,10 @@ def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
     told = {number: line for number, line in below if line[0] != "("}  # units
     expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
     values = table_of(path, told, "positions", expected).numbers(expected, range(10))
-    north, east = (_degrees(values[:, k : k + 3]) for k in (3, 6))
+    parts = (values[:, k : k + 3].T for k in (3, 6))
+    north, east = (np.copysign(np.abs(d) + m / 60 + s / 3600, d) for d, m, s in parts)
     times = GPS_EPOCH + WEEK * values[:, 1] + values[:, 2]
     return on_earth(times, np.column_stack([north, east, values[:, 9]]), np.empty((0, 6, 6)))
-
-
-def _degrees(parts: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    whole, minutes, seconds = parts.T
-    return np.copysign(np.abs(whole) + minutes / 60 + seconds / 3600, whole)
 
 
 def on_earth(times: Times, places: Float[np.ndarray, "n 3"], P: np.ndarray) -> Log:
