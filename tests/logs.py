@@ -281,6 +281,17 @@ def kitti(timed):
     return write
 
 
+def matrices(columns):
+    """A time and all of T_wc, by rows or by columns; covariances by their stamps."""
+
+    def write(folder):
+        tum(folder)
+        for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
+            lines(folder / f"{name}.txt", TIMES, np.swapaxes(T, 1, 2) if columns else T)
+
+    return write
+
+
 def of_planes(values):
     def write(folder):
         lines(folder / "estimate.txt", TIMES, FLAT)
@@ -405,8 +416,9 @@ def from_base(titles):
     return write
 
 
-def on_earth(folder, utc=False):
-    """RTKLIB's solution at 22° south, and NovAtel's truth in degrees, minutes and seconds."""
+def on_earth(folder, utc=False, fixes=""):
+    """RTKLIB's solution at 22° south, or NavSatFix of ROS, echoed or under titles; and NovAtel's
+    truth in degrees, minutes and seconds."""
     seconds = 455342.0 + np.arange(STEPS)
     zero = np.zeros(STEPS)
     latitude, longitude, height = -22.3 - 1e-4 * np.arange(STEPS), zero + 114.2, zero + 5
@@ -423,7 +435,13 @@ def on_earth(folder, utc=False):
     roots = [np.sign(ENU_P[x]) * np.sqrt(abs(ENU_P[x])) + zero for x in order]
     titles = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m)"
     week = zero + 2158
-    if utc:
+    if fixes:
+        stamps = 315964800 + 604800 * week + seconds, zero
+        cov = np.tile(ENU_P.ravel(), (STEPS, 1))
+        rows = np.column_stack([*stamps, zero, zero, *own, cov, zero]).tolist()
+        told = [",".join([*map(repr, x[:2]), "gps", *map(repr, x[2:])]) for x in rows]
+        (folder / "estimate.pos").write_text(fixes.strip() + "\n" + "\n".join(told) + "\n")
+    elif utc:
         week, seconds = zero + 2123, 1.6e9 + 18 - 315964800 - 2123 * 604800 + np.arange(STEPS)
         told = titles.partition(" Q")[0].replace(" ", ",")
         rtklib(folder, "estimate.pos", told, np.column_stack(own), [x[0] for x in roots])
@@ -453,13 +471,34 @@ def echoed(folder):
     (folder / "estimate.csv").write_text("\n".join(rows) + "\n")
 
 
-def nclt(folder):
+def nclt(folder, degrees=False):
     """Microseconds, positions, and roll, pitch and yaw."""
     tum(folder)
     for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
         (folder / f"{name}.txt").unlink()
-        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")
+        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=degrees)
         lines(folder / f"{name}.csv", np.round(1e6 * TIMES), T[:, :3, 3], angles, between=",")
+
+
+def in_degrees(*names, graph=False):
+    """Robots in a plane, without titles or of g2o; angles of these files are in degrees."""
+
+    def write(folder):
+        spread = lines(folder / "covariance.txt", TIMES, FLAT_SIGMA, header="# error=split\n")
+        for name, flat in (("estimate", FLAT), ("truth", FLAT_TRUTH)):
+            rows = np.column_stack([TIMES, flat])
+            rows[:, 3] *= 180 / np.pi if name in names else 1.0
+            if graph:
+                rows[:, 0] = np.arange(STEPS)
+                told = "".join(
+                    f"VERTEX_SE2 {i:.0f} {x!r} {y!r} {a!r}\n" for i, x, y, a in rows.tolist()
+                )
+                (folder / f"{name}.g2o").write_text(told)
+                lines(spread, rows[:, 0], FLAT_SIGMA, header="# error=split\n")
+            else:
+                lines(folder / f"{name}.txt", rows)
+
+    return write
 
 
 def graph(folder):
@@ -688,12 +727,27 @@ LOGS = {
     "RTKLIB and NovAtel": Log(on_earth, OF_ENU, convention=Convention("split", "body")),
     "RTKLIB in UTC and NovAtel": Log(lambda x: on_earth(x, utc=True), OF_ENU, rtol=2e-3,
                                      convention=Convention("split", "body"), spare=True),
+    **{
+        f"NavSatFix, {name}": Log(partial(on_earth, fixes=titles), OF_ENU, rtol=1e-3,
+                                  convention=Convention("split", "body"), spare=True)
+        for name, titles in (("echo of ROS 2", " "), ("titles", (
+            "header.stamp.secs,header.stamp.nsecs,header.frame_id,status.status,status.service,"
+            "latitude,longitude,altitude,"
+            + "".join(f"position_covariance_{i}," for i in range(9)) + "position_covariance_type"
+        )))
+    },
     "RTKLIB, ECEF": Log(from_base(
         "x-ecef(m),y-ecef(m),z-ecef(m)"), OF_ENU, convention=SPLIT, spare=True),
     "RTKLIB, from its base": Log(from_base(
         "e-baseline(m),n-baseline(m),u-baseline(m)"), OF_ENU, convention=SPLIT, spare=True),
     "g2o": Log(graph),
     "NCLT": Log(nclt),
+    "NCLT in degrees": Log(partial(nclt, degrees=True)),
+    **{
+        f"plane, degrees in {' and '.join(names)}": Log(in_degrees(*names), IN_THE_PLANE)
+        for names in (("estimate",), ("truth",), ("estimate", "truth"))
+    },
+    "g2o in a plane, degrees": Log(in_degrees("estimate", "truth", graph=True), IN_THE_PLANE),
     "TUM, names of rpg_trajectory_evaluation": Log(
         lambda x: tum(x, "stamped_traj_estimate.txt", truth="stamped_groundtruth.txt")),
     "TUM, seconds and nanoseconds": Log(rewritten(
@@ -711,6 +765,8 @@ LOGS = {
         evaluate_poses, *(np.array(x) for x in ([ESTIMATE, OTHER], [P, P], [TRUTH, TRUTH])),
         Convention(**MIXED),
     )),
+    "matrices of ARKit": Log(matrices(columns=True)),
+    "matrices with a time": Log(matrices(columns=False)),
     "KITTI": Log(kitti(timed=False)),
     "KITTI, timed": Log(kitti(timed=True)),
     "plane, triangle": Log(of_planes(FLAT_P[:, *UPPER3]), IN_THE_PLANE),

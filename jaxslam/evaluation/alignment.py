@@ -36,8 +36,6 @@ MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
-SMALL = 0.5
-"""The largest σ by the error of a first pose, of the median of all, at which runs are aligned."""
 
 
 class Similarity(NamedTuple):
@@ -107,6 +105,16 @@ def angles(R: Matrices, others: np.ndarray) -> np.ndarray:
     """The angles between rotations."""
     chord = np.linalg.norm(R - others, axis=(-2, -1)) / np.sqrt(2)
     return np.asarray(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
+
+
+def apart(R: Matrices, others: np.ndarray) -> float:
+    """The median angle between rotations, up to a constant, as of another world or body."""
+    turn = np.swapaxes(R, 1, 2) @ others
+    return float(np.median(angles(turn, nearest_rotation(turn.mean(axis=0)))))
+
+
+TURNED = np.radians(20)
+"""Rotations that are apart by more are misread, if they are by a quarter of it when read anew."""
 
 
 def similarity(
@@ -202,7 +210,10 @@ def most_nees(
     however both correlate: `(√tr A⁻¹P + √tr A⁻¹M)²/n`, with the `assumed` covariance A."""
     A, *both = (x[:, axes[:, None], axes] for x in (assumed, own, moved))
     scale = np.sqrt(np.maximum(np.diagonal(A, axis1=1, axis2=2), np.finfo(float).tiny))
-    A, *both = (x / scale[:, :, None] / scale[:, None] for x in (A, *both))
+    with np.errstate(over="ignore"):
+        A, *both = (
+            np.clip(x / scale[:, :, None] / scale[:, None], -1e150, 1e150) for x in (A, *both)
+        )
     A += 1e-9 * np.eye(len(axes))  # a fit of few poses leaves no variance in some directions
     share = (np.trace(np.linalg.solve(A, x), axis1=1, axis2=2) / len(axes) for x in both)
     return sum(np.sqrt(np.maximum(x, 0.0)) for x in share) ** 2
@@ -343,7 +354,7 @@ def _small_at_first(poses: Poses) -> bool:
                 np.diagonal(x, axis1=1, axis2=2)[:, part].max(axis=1)
                 for x in (moved, run.covariances)
             )
-            if np.median(variance) > SMALL**2 * np.median(own):
+            if np.median(variance) > 0.5**2 * np.median(own):  # half of σ
                 return False
     return True
 

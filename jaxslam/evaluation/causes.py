@@ -7,8 +7,9 @@ on strong evidence, with a number and the NEES without it; then there is no verd
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import combinations, product
 from typing import Any
 
@@ -17,16 +18,18 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Float
 
 from jaxslam.evaluation.alignment import (
+    TURNED,
     aligned,
     angles,
+    apart,
     nearest_rotation,
     similarity,
 )
 from jaxslam.evaluation.comparison import compared
-from jaxslam.evaluation.convention import Matrices
+from jaxslam.evaluation.convention import Matrices, Squares
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
-from jaxslam.evaluation.sanity_checks import Mistake
+from jaxslam.evaluation.sanity_checks import DEGREES, Mistake
 from jaxslam.io.tum import poses as poses_of
 from jaxslam.io.tum import quaternions
 
@@ -38,10 +41,13 @@ CLEARLY = 1.5
 """The factor of NEES below which a cause explains as much as another, which has more numbers."""
 LESS = 3.0
 """The factor by which a constant that is fitted lessens the errors that it explains."""
-TURNED = np.radians(60)
+HEADED = np.radians(60)
 """A rotation between worlds that is no error of a filter's first heading."""
 UNEXPLAINED = 5.0
 """Errors that a constant leaves, in σ of the worst axis, beyond which the filter is wrong."""
+FAR, ABSURD = np.log(2.0), np.log(10.0)
+"""Logs of factors of σ: from which on it is asked what else covariances may be, and one that no
+filter has."""
 HALF = 1.3
 """How near σ of all rotations, or positions, is to half angles (the right ones), as a factor."""
 MANY = 10
@@ -54,16 +60,18 @@ FEWEST, ALPHA = 4, 1e-3
 """The fewest runs that a constant can be common to, and the chance that one is found of none."""
 
 
-def causes(poses: Poses, found: Evaluation) -> Iterator[Mistake]:
-    """The causes of an evaluation that found a filter over-confident; none of others."""
+def causes(poses: Poses, found: Evaluation, used: tuple[str, ...] = ()) -> Iterator[Mistake]:
+    """The causes of an evaluation whose errors are larger than σ says, or far smaller; of the axes
+    used if any were named."""
     yield from _repeated(poses)
-    if not suspect(found) or poses.convention.scale == "given":
+    wrong = suspect(found)
+    if poses.convention.scale == "given" or not (wrong or np.abs(_factors(found)).max() > FAR):
         return
     if (few := poses.some()) is not poses:
         poses, found = few, compared(few)
     turns, told = any(name.startswith("r") for name in found.names), list[Mistake]()
-    spatial = turns and poses.estimates.shape[-1] == 4
-    for look in (_misread, _tilt, _between, _half_angles)[not turns : 3 + spatial]:
+    looks = _misread, _tilt, _between, partial(_written, used)
+    for look in looks[not turns if wrong else 3 :]:
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
@@ -123,10 +131,7 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
     n, there = poses.estimates.shape[-1] - 1, poses.logged
 
     def off(of: Poses) -> float:
-        R, true = (x[there][:, :n, :n] for x in (of.estimates, of.truths))
-        turn = np.swapaxes(R, 1, 2) @ true
-        # Up to a constant, as of another world or body.
-        return float(np.median(angles(turn, nearest_rotation(turn.mean(axis=0)))))
+        return apart(*(x[there][:, :n, :n] for x in (of.estimates, of.truths)))
 
     before, ones = off(poses), list[Mistake]()
     ways = (
@@ -139,7 +144,7 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
         after = off(changed)
         fixed = compared(changed) if after < before else found
         # σ of rotations may be as large as what is left.
-        far, near, less = before > np.radians(20), after < before / 4, _nees(found) / _nees(fixed)
+        far, near, less = before > TURNED, after < before / 4, _nees(found) / _nees(fixed)
         if (far and near and less > CLEARLY) or (less > 10 and explained(fixed)):
             certain = bool(far and (near or len(there) >= FEWEST))
             one = Mistake(
@@ -184,7 +189,7 @@ def _worlds(poses: Poses, found: Evaluation) -> Mistake | None:
     sigma = float(np.median(own)) * (1 if len(rows) >= FEWEST else 2) if own.size else 0.0
     by = "yaw" if n == 3 and tilt < np.radians(2) else "se3"
     by, left = ("sim3", scaled) if scaled < left / LESS else (by, left)
-    apart = first > max(0.2 * rms, 5 * sigma) or angle > TURNED
+    apart = first > max(0.2 * rms, 5 * sigma) or angle > HEADED
     apart |= by == "sim3" and np.isclose(max(scale, 1 / scale), LENGTHS, rtol=0.02).any()
     if rms <= 5 * max(left, 1e-12) or not apart:
         return None
@@ -309,10 +314,7 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
     one of the body if positions are no worse for it, or the body turns against its world.
     """
     turns = np.array([name.startswith("r") for name in found.names])
-    ratio, left = (
-        np.sqrt(np.mean((x.errors[x.logged] / x.sigmas[x.logged]) ** 2, axis=0))
-        for x in (found, fixed)
-    )
+    ratio, left = (np.exp(_factors(x)) for x in (found, fixed))
     n = poses.estimates.shape[-1] - 1
     R = poses.estimates[:, :, :n, :n][poses.logged]
     axis = poses.truths[:, :, :n, :n][poses.logged] @ np.swapaxes(R, 1, 2)
@@ -343,25 +345,58 @@ def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
     return bool(2 * scipy.special.stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
-def _half_angles(poses: Poses, found: Evaluation) -> Mistake | None:
-    """Covariances of the vector part of a quaternion: σ of all rotations is half, and no other."""
-    scale = np.array([2.0 if name.startswith("r") else 1.0 for name in poses.names])
-    whole = poses._replace(covariances=scale[:, None] * poses.covariances * scale)
-    fixed, certain = compared(whole), len(poses.logged) >= FEWEST
-    parts = (tuple(x for x in found.names if x.startswith("r") == turn) for turn in (False, True))
-    for names in filter(None, parts):
-        if not explained(part := compared(whole._replace(used=names))):
+def _written(used: tuple[str, ...], poses: Poses, found: Evaluation) -> Mistake | None:
+    """Covariances that are other numbers, with which σ of positions and of rotations are right."""
+    P, turn = poses.covariances, np.array([name.startswith("r") for name in poses.names])
+
+    def scaled(by: float) -> Squares:
+        scale = np.where(turn, by, 1.0)
+        return scale[:, None] * P * scale
+
+    ways = {
+        "of half angles": (lambda: scaled(2.0), "angle=half in their header (g2o)"),
+        "of angles in degrees": (lambda: scaled(1 / DEGREES), "angle=deg in their header"),
+        "information matrices": (lambda: np.linalg.pinv(P, hermitian=True), "their inverses"),
+    }
+    if not np.any(P * ~np.eye(len(turn), dtype=bool)):
+        ways |= {
+            "σ in place of variances": (lambda: P**2, "their squares"),
+            "of variances in place of σ": (lambda: np.sqrt(P), "their roots"),
+        }
+    poses = poses._replace(used=used)
+    ones = [_instead_of(poses, found, what, *way) for what, way in ways.items()]
+    return min(filter(None, ones), key=lambda x: not x.certain, default=None)
+
+
+def _instead_of(
+    poses: Poses, found: Evaluation, what: str, change: Callable[[], Squares], write: str
+) -> Mistake | None:
+    """The cause that covariances are `what`, where nothing is wrong once they are changed: in no
+    part, and beyond doubt if the σ of no axis stands out, and as they are it is wrong by far."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"), suppress(ValueError):
+        whole = poses._replace(covariances=change())
+        fixed, off = compared(whole), np.abs(_factors(found))
+        names = [[x for x in fixed.names if x.startswith("r") == of] for of in (False, True)]
+        parts = [compared(whole._replace(used=tuple(x))) for x in names if x]
+        if not all(map(explained, (fixed, *parts))):
             return None
-        off = np.log([part.axis_verdict(i)["sigma_factor"] or np.inf for i in range(len(names))])
         # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
-        certain &= bool(abs(off.mean()) <= np.log(HALF) and np.ptp(off) <= 3 * np.log(HALF))
-    if not explained(fixed):
-        return None
-    return Mistake(
-        "half angles" if certain else "the covariances may be of half angles",
-        "σ of all rotations is half of the right one, and that of positions right, as if the "
-        f"covariances were of the vector part of a quaternion (g2o): with angle=half in their "
-        f"header {_instead(fixed, found)}. If they are of angles, the filter is over-confident",
-        _nees(fixed),
-        certain,
-    )
+        few = len(poses.logged) < FEWEST
+        left, width = [_factors(part) for part in parts], (1 + few) * np.log(HALF)
+        near = all(abs(x.mean()) < width and np.ptp(x) < 3 * width for x in left)
+        certain = bool(near and (not few or off.max() > ABSURD))
+        if not near and not (suspect(found) and "half" in what):
+            return None
+        told = (
+            f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {write} "
+            f"{_instead(fixed, found)}. If they are what they are said to be, the filter is wrong"
+        )
+        are = "are" if certain else "may be"
+        return Mistake(f"the covariances {are} {what}", told, _nees(fixed), certain)
+    return None
+
+
+def _factors(found: Evaluation) -> Float[np.ndarray, " n"]:
+    """The logs of the factors by which σ of every axis is too small."""
+    z = np.clip(found.errors[found.logged] / found.sigmas[found.logged], -1e150, 1e150)
+    return np.log(np.mean(z**2, axis=0) + 1e-300) / 2

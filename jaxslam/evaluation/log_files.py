@@ -47,20 +47,12 @@ Runs = tuple[RunFiles, ...]
 
 
 def evaluate_log(
-    source: str | Path,
-    *,
-    covariance: str | Path | None = None,
-    truth: str | Path | None = None,
-    estimate: str | None = None,
-    stated: Mapping[str, str] | None = None,
-    align: str = "none",
-    axes_used: str | Sequence[str] = (),
-    nis: bool = False,
-    truth_sigma: Sequence[float] | None = None,
-    innovations: str | Path | None = None,
-    time_offset: float | str = 0.0,
-    against: str | Path | None = None,
-) -> Evaluation:
+    source: str | Path, *, covariance: str | Path | None = None, truth: str | Path | None = None,
+    estimate: str | None = None, stated: Mapping[str, str] | None = None, align: str = "none",
+    axes_used: str | Sequence[str] = (), nis: bool = False,
+    truth_sigma: Sequence[float] | None = None, innovations: str | Path | None = None,
+    time_offset: float | str = 0.0, against: str | Path | None = None,
+) -> Evaluation:  # fmt: skip
     """The verdict on what a file or a folder holds.
 
     `source` is a file of arrays (npz, mat), a table of `run, step, errors, upper triangle` lines, a
@@ -156,10 +148,6 @@ def _evaluate_arrays(
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt", "traj_estimate.txt")
 COVARIANCES = ("covariance.txt", "state_deviation.txt")
 TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt", "reference.txt", "ref.txt")
-LOOKED_AT = 10
-"""The most runs whose clocks are looked at."""
-CLEARLY = 1.2
-"""The factor by which a NEES falls without its cause."""
 TEXTS = (".txt", ".csv", ".tum", ".pos", ".smfeval", ".dat", ".g2o")
 """Endings of a file of these names; what it is says its content."""
 
@@ -251,13 +239,9 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _of_runs(
-    source: Path,
-    runs: Runs,
-    stated: dict[str, str],
-    how: Options,
-    time_offset: float | str,
+    source: Path, runs: Runs, stated: dict[str, str], how: Options, time_offset: float | str,
     against: bool,
-) -> Evaluation:
+) -> Evaluation:  # fmt: skip
     """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
     `how` are the options of `evaluate_poses`; for the others see `evaluate_log`.
@@ -305,7 +289,7 @@ def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
     """The evaluation with the offset of the clocks as the cause, where NEES falls without it; and,
     where that is not certain, nothing else is wrong."""
     before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
-    certain = bool(late.found and after < before / CLEARLY)
+    certain = bool(late.found and after < before / 1.2)  # so a NEES falls without its cause
     if not certain and (after >= before or not explained(fixed)):
         return found
     error = float(f"{1e3 * late.sigma:.1g}")
@@ -322,7 +306,7 @@ def _in_time(found: Evaluation, fixed: Evaluation, late: Offset) -> Evaluation:
 
 def _offset(logs: list[RunLogs]) -> Offset | None:
     """The median offset of the runs' clocks, by their σ; None where rotations do not tell it."""
-    told = (one.offset for one in logs[:LOOKED_AT])
+    told = (one.offset for one in logs[:10])  # more would say no more
     offsets = [x for x in told if x is not None and np.isfinite(x.sigma)]
     if not offsets:
         return None

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, angles, associated
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, TURNED, angles, apart, associated
 from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
@@ -30,14 +30,12 @@ from jaxslam.io import ros
 from jaxslam.io.logs import read_log
 from jaxslam.io.logs.frames import read_frames
 from jaxslam.io.logs.geodetic import GPS_EPOCH, WEEK
-from jaxslam.io.logs.log import Log, check_seconds, interpolated
+from jaxslam.io.logs.log import TAKEN, Log, check_seconds, interpolated
 from jaxslam.io.tum import Times
 
 Place: TypeAlias = Path | ros.Topic
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
-BACK = 0.01
-"""The largest share of stamps that may go back in time, and are then left out."""
 DENSE = 0.3
 """The largest error of interpolation, in σ of the estimate, of a truth that is interpolated."""
 SPARSE = 3.0
@@ -114,7 +112,7 @@ def read(place: Place) -> Log:
 
 def _in_order(place: Place, log: Log) -> Log:
     back = log.times < np.maximum.accumulate(log.times)
-    if 0 < back.sum() <= BACK * len(back):
+    if 0 < back.sum() <= 0.01 * len(back):  # more are no accident
         log = _of_rows(log, ~back, f"stamps that go back in time and are left out: {back.sum()}")
     _check_times(place, log.times)
     last = np.append(np.diff(log.times) > 0, True)
@@ -123,9 +121,11 @@ def _in_order(place: Place, log: Log) -> Log:
 
 
 def _of_rows(log: Log, rows: Bool[np.ndarray, " n"], note: str) -> Log:
-    poses, P = (x[rows] if len(x) else x for x in (log.poses, log.covariances))
-    times, notes = log.times[rows], (*log.notes, note)
-    return log._replace(times=times, poses=poses, covariances=P, notes=notes)
+    times, poses, P, other = (
+        x[rows] if len(x) else x for x in (log.times, log.poses, log.covariances, log.otherwise)
+    )
+    notes = (*log.notes, note)
+    return log._replace(times=times, poses=poses, covariances=P, otherwise=other, notes=notes)
 
 
 def read_run(run: RunFiles) -> RunLogs:
@@ -133,6 +133,7 @@ def read_run(run: RunFiles) -> RunLogs:
     log, truth = read(run.estimate), read(run.truth)
     if geometry_of(truth.poses) is not geometry_of(log.poses):
         raise ValueError(f"{run.truth}: estimate and truth must both be planar or both be spatial")
+    log, truth = _in_one_unit(log, truth)
     if log.stamped != truth.stamped or (not log.stamped and len(log.times) != len(truth.times)):
         raise ValueError(
             f"{run.estimate} has {len(log.times)} poses and {run.truth} {len(truth.times)}, and "
@@ -163,6 +164,28 @@ def read_run(run: RunFiles) -> RunLogs:
     unused = ~np.isin(np.arange(len(own.times)), of)
     log = log._replace(covariances=P, said=own.said, assumed=own.assumed)
     return RunLogs(run, log, truth, own.times, unused, oriented, notes)
+
+
+def _in_one_unit(log: Log, truth: Log) -> tuple[Log, Log]:
+    """Both; or one with its angles in the other unit, where no title says it, and only so the
+    rotations agree."""
+
+    def off(own: Log, true: Log) -> float:
+        n, known = own.poses.shape[-1] - 1, ~np.isnan(true.poses[:, 0, 0])
+        at = interpolated(true.times[known], true.poses[known], own.times)
+        there = ~np.isnan(at[:, 0, 0] + own.poses[:, 0, 0])
+        return apart(own.poses[there, :n, :n], at[there, :n, :n]) if there.any() else np.inf
+
+    def anew(one: Log) -> Log:
+        notes = *one.notes, TAKEN.format("the other's, degrees or radians")
+        return one._replace(poses=one.otherwise, notes=notes) if len(one.otherwise) else one
+
+    if not (len(log.otherwise) or len(truth.otherwise)) or len(truth.times) < 2:
+        return log, truth
+    ways = (log, truth), (anew(log), truth), (log, anew(truth))
+    before, *others = (off(*way) for way in ways)
+    best = 1 + int(np.argmin(others))
+    return ways[best] if before > TURNED and min(others) < before / 4 else ways[0]
 
 
 def paired(logs: RunLogs, time_offset: float | str = 0.0) -> RunLog:
@@ -271,10 +294,10 @@ def _of_clocks(own: Times, others: Float[np.ndarray, " m"]) -> str:
     weeks = GPS_EPOCH + WEEK * max(round((abs(late) - GPS_EPOCH) / WEEK), 0)
     zones = HALF_HOUR * min(round(abs(late) / HALF_HOUR), 28)
     clocks = {LEAPS: "GPS time", LEAPS + 19: "TAI, as of PTP", zones: "another zone"}
-    for apart, clock in (clocks | {weeks - LEAPS: "GPS time", weeks: "GPS time"}).items():
-        if abs(abs(late) - apart) < min(longest, 0.01 * apart):
-            told = f"--time-offset {np.copysign(apart, late):.0f}"
-            return f". One may be of {clock}, which is {apart:.0f} s off: then say {told}"
+    for away, clock in (clocks | {weeks - LEAPS: "GPS time", weeks: "GPS time"}).items():
+        if abs(abs(late) - away) < min(longest, 0.01 * away):
+            told = f"--time-offset {np.copysign(away, late):.0f}"
+            return f". One may be of {clock}, which is {away:.0f} s off: then say {told}"
     return ""
 
 

@@ -16,30 +16,18 @@ from jaxslam.evaluation.causes import causes, explained, suspect
 from jaxslam.evaluation.comparison import compared, stated_errors
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
-from jaxslam.evaluation.inputs import (
-    Poses,
-    checked_poses,
-    filled,
-    squared,
-    step_times,
-    whitened,
-)
+from jaxslam.evaluation.inputs import Poses, checked_poses, filled, squared, step_times, whitened
 from jaxslam.evaluation.result import Evaluation, described, of_steps
 from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.io.text import vector_of
 
 
 def evaluate_poses(
-    estimates: ArrayLike,
-    covariances: ArrayLike,
-    truths: ArrayLike,
-    convention: Convention | None = None,
-    *,
-    align: str = "none",
-    axes_used: str | Sequence[str] = (),
-    times: ArrayLike | None = None,
+    estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike,
+    convention: Convention | None = None, *, align: str = "none",
+    axes_used: str | Sequence[str] = (), times: ArrayLike | None = None,
     truth_sigma: Sequence[float] | None = None,
-) -> Evaluation:
+) -> Evaluation:  # fmt: skip
     """The verdict on a filter from its poses T_wc, m, and the true ones.
 
     `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 6) of x, y, z and a rotation
@@ -69,7 +57,7 @@ def evaluate_poses(
     names = tuple(name for name in poses.names if name in used)
     found = compared(poses._replace(align=align, used=names, truth_sigma=sigma))
     poses = poses._replace(align=align, used=found.names, truth_sigma=sigma)
-    why = tuple(causes(poses, found))
+    why = tuple(causes(poses, found, names))
     open_still = not any(x.certain for x in why)
     identified = _identified(poses, wrong=suspect(found) and open_still)
     if identified.doubtful and found.most is not None and not suspect(found):

@@ -16,14 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
-from jaxslam.evaluation.convention import (
-    Convention,
-    Joints,
-    Matrices,
-    Squares,
-    Tangents,
-    converted,
-)
+from jaxslam.evaluation.convention import Convention, Joints, Matrices, Squares, Tangents, converted
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
@@ -118,16 +111,11 @@ class Scale:
         (low, high), median, sigma = self.over_runs
         rms, in_sigma = json_numbers(np.array([self.rms, self.factor]))
         return {
-            "log_scale": json_numbers(self.log_scale),
-            "drift": json_numbers(median),
-            "drift95": [json_numbers(low), json_numbers(high)],
-            "sigma": json_numbers(sigma),
-            "drift_rms": rms,
-            "drift_in_sigma": in_sigma,
-            "fitted": self.fitted,
-            "verdict": self.verdict,
-            "disproved": self.disproved,
-        }
+            "log_scale": json_numbers(self.log_scale), "drift": json_numbers(median),
+            "drift95": [json_numbers(low), json_numbers(high)], "sigma": json_numbers(sigma),
+            "drift_rms": rms, "drift_in_sigma": in_sigma, "fitted": self.fitted,
+            "verdict": self.verdict, "disproved": self.disproved,
+        }  # fmt: skip
 
 
 def at_one_scale(poses: Poses) -> tuple[PerAxis, Squares, Scale]:

@@ -8,14 +8,7 @@ from pathlib import Path
 
 from jaxslam.io.imu_calibration import pose_of_keys
 from jaxslam.io.lens_files import read_calibration, yaml_keys
-from jaxslam.io.recording import (
-    Layout,
-    Recording,
-    fixed,
-    listed,
-    of_files,
-    read_timestamps,
-)
+from jaxslam.io.recording import Layout, Recording, fixed, listed, of_files, read_timestamps
 from jaxslam.io.source import Trajectory
 from jaxslam.io.text import read_table
 from jaxslam.io.tum import rows_as_poses

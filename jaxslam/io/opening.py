@@ -7,11 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jaxslam.io.calibration import (
-    GUESSED_FIELD_OF_VIEW,
-    Calibration,
-    from_field_of_view,
-)
+from jaxslam.io.calibration import GUESSED_FIELD_OF_VIEW, Calibration, from_field_of_view
 from jaxslam.io.camera import CAMERA
 from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
@@ -31,17 +27,10 @@ WIDEST = 1280
 
 
 def open_source(
-    path: str | Path,
-    *,
-    calibration: str | Path | None = None,
-    fov: float | None = None,
-    reference: str | Path | None = None,
-    rate: float = 30.0,
-    start: float = 0.0,
-    every: int = 1,
-    frames: int | None = None,
-    scale: float | None = None,
-) -> Source:
+    path: str | Path, *, calibration: str | Path | None = None, fov: float | None = None,
+    reference: str | Path | None = None, rate: float = 30.0, start: float = 0.0, every: int = 1,
+    frames: int | None = None, scale: float | None = None,
+) -> Source:  # fmt: skip
     """The video at `path`, in the first of `LAYOUTS` that recognises it.
 
     `calibration` (JSON, or of another program), `fov` (horizontal field of view, degrees) and

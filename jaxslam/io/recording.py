@@ -60,12 +60,9 @@ class Layout(NamedTuple):
 
 
 def of_files(
-    path: Path,
-    files: list[Path],
-    times: Float[np.ndarray, " n"],
-    calibration: Calibrator | None = None,
-    reference: Trajectory | None = None,
-) -> Recording:
+    path: Path, files: list[Path], times: Float[np.ndarray, " n"],
+    calibration: Calibrator | None = None, reference: Trajectory | None = None,
+) -> Recording:  # fmt: skip
     """A recording of image files of the folder `path`.
 
     Its `calibration.json`, where it has one, is better than what the layout says.
@@ -244,10 +241,9 @@ def _open_timestamped(path: Path, _rate: float) -> Recording:
 
 
 TIMESTAMPED = Layout(
-    "a folder with images/ and timestamps.txt",
-    lambda path: (path / "timestamps.txt").is_file(),
+    "a folder with images/ and timestamps.txt", lambda path: (path / "timestamps.txt").is_file(),
     _open_timestamped,
-)
+)  # fmt: skip
 PLAIN = Layout(
     "a folder of images", lambda path: path.is_dir() and bool(image_files(path)), _open_plain
 )

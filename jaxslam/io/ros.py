@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
-from jaxslam.io.logs.log import Log, interpolated
+from jaxslam.io.logs.log import ROS, Log, interpolated
 from jaxslam.io.tum import rows_as_poses
 
 Message: TypeAlias = Any
@@ -29,8 +29,6 @@ POSES = (
     *WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Path",
 )  # fmt: skip
-ROS = {"error": "split", "axes": "world"}
-"""The convention of PoseWithCovariance, as ROS documents it."""
 
 
 class Topic(NamedTuple):

@@ -24,6 +24,14 @@ _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
 DATE = re.compile(r"(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d)")
 """A date and time, which are a cell, in whatever columns."""
 ISO = r"\1-\2-\3T\4"
+_TITLED = "write a table with titles instead, as t,x,y,z,qx,qy,qz,qw, a pose per line"
+_OTHERS = {
+    r"[{[]": ("JSON", _TITLED),
+    r"---$|(- )?[A-Za-z_]\w*:( -?[\d.]+)?$": ("YAML", f"{_TITLED} (ros2 topic echo --csv does)"),
+    r"\$[A-Z]{4,6},": ("NMEA", "write latitude, longitude and altitude under titles, or a .pos"),
+    r"<": ("XML", _TITLED),
+}
+"""The first lines of files that are no tables: what they are, and what to write instead."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
@@ -109,6 +117,10 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
 
 def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
     """The same of the lines of a file."""
+    first = next(iter(told.values()), "")
+    for mark, (kind, instead) in _OTHERS.items():
+        if re.match(mark, first):
+            raise ValueError(f"{path}: is {kind}, which is not read; {instead}")
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
     lines = {n: DATE.sub(ISO, line) for n, line in told.items() if not _is_comment(line)}
     named = []

@@ -262,6 +262,11 @@ def _of_one_run(found: Verdict, nees: PerStep, whitened: PerAxis, dof: int) -> V
     if not one.over_confident:
         # A part of the error that never changes may hide the rest of its variance.
         right = found["word"] in ("consistent", "under-confident")
+        others = (part["word"] for part in (found["mean"], *found["thirds"]))
+        lone = found["of"] == "last step" and "over-confident" not in others
+        if lone and one.samples >= FEWEST:  # of so many one step may be of a heavy tail
+            none = {"word": "cannot tell"}
+            found |= found["mean"] | none | {"of": "all steps", "end": found["end"] | none}
         return found | {"word": "cannot tell"} if right else found
     return found | {
         "word": "over-confident",

@@ -9,7 +9,7 @@ from verdicts import displaced
 
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_poses
 from jaxslam.evaluation.sanity_checks import Mistake
-from jaxslam.geometry import PLANAR
+from jaxslam.geometry import PLANAR, SPATIAL
 
 SPLIT = Convention("split", "world")
 STEPS = 25
@@ -42,6 +42,15 @@ def of_inverse_truth(rng, log):
     return log._replace(dense=np.linalg.inv(log.dense))
 
 
+def inverted(_, log):
+    return log._replace(covariances=np.linalg.inv(log.covariances))
+
+
+def of_degrees(_, log):
+    scale = np.where([x.startswith("r") for x in log.convention.names(SPATIAL)], 180 / np.pi, 1.0)
+    return log._replace(covariances=scale[:, None] * log.covariances * scale)
+
+
 def in_millimetres(rng, log):
     truths = log.dense.copy()
     truths[..., :3, 3] *= 1e3
@@ -56,6 +65,8 @@ FAULTS = {
     "w first, of the truth": (of_truth, "of the truth have w first"),
     "the world in the body": (inverse, "poses of the estimate are inverse"),
     "the world in the body, of the truth": (of_inverse_truth, "poses of the truth are inverse"),
+    "information matrices": (inverted, "are information matrices"),
+    "covariances in degrees": (of_degrees, "are of angles in degrees"),
     "truth in millimetres": (in_millimetres, "not in one world"),
 }
 
@@ -145,6 +156,40 @@ def test_a_run_that_is_logged_twice_is_named_and_one_that_begins_alike_is_not():
     alike[:, :5] = T[0, :5]
     found = evaluate_poses(alike, P, true, RIGHT.convention)
     assert not [mistake for mistake in found.mistakes if "twice" in mistake.what]
+
+
+@pytest.mark.parametrize("runs", [1, 8])
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (np.sqrt, "σ in place of variances"), (np.square, "variances in place of σ"),
+        (np.copy, ""), (lambda P: 1e-2 * P, ""), (lambda P: 30 * P, ""),
+    ],
+)  # fmt: skip
+def test_what_is_written_in_place_of_variances_is_named_and_a_wrong_variance_is_not(
+    change, word, runs
+):
+    T, _, _ = logged(SPLIT, runs=runs, steps=100)
+    P = np.tile(np.diag([0.05, 0.04, 0.08, 0.01, 0.02, 0.01]) ** 2, (runs, 100, 1, 1))
+    noise = np.random.default_rng(0).normal(size=(runs, 100, 6)) @ np.sqrt(P[0, 0])
+    found = evaluate_poses(T, change(P), displaced(T, noise, SPLIT), SPLIT)
+    if word:
+        (cause,) = found.mistakes
+        assert word in cause.what
+        assert cause.nees == pytest.approx(6, rel=0.1)
+    assert word or not found.mistakes
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("align", ["none", "first", "yaw"])
+@pytest.mark.parametrize(("size", "variance"), [(1e99, 1e-120), (1.0, 1e-300), (1e-150, 1e-300)])
+def test_numbers_at_the_limits_make_no_warning(size, variance, align):
+    rng = np.random.default_rng(0)
+    T = np.tile(np.eye(4), (2, 8, 1, 1))
+    T[..., :3, 3] = rng.normal(size=(2, 8, 3))
+    true, P = T.copy(), np.tile(variance * np.eye(6), (2, 8, 1, 1))
+    true[..., :3, 3] += size * rng.normal(size=(2, 8, 3))
+    assert str(evaluate_poses(T, P, true, align=align))
 
 
 def drifting(log):

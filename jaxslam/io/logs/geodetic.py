@@ -22,8 +22,8 @@ EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 GPS_EPOCH = 315964800.0
 """Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
 WEEK = 604800.0
-SAID, ENU = {"error": "split", "axes": "body"}, "east, north and up"
-NOTE = "x, y, z are {}; times are those of GPS"
+SAID = {"error": "split", "axes": "body"}
+ENU, GPS_TIME = "x, y, z are east, north and up", "times are those of GPS"
 _RTKLIB = {
     "latitude(deg) longitude(deg) height(m)": "sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)",
     "x-ecef(m) y-ecef(m) z-ecef(m)": "sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)",
@@ -57,10 +57,10 @@ def read_rtklib(table: Table) -> Log | None:
     roots = roots[:, [1, 0, 2, 3, 5, 4]] if geodetic else roots
     P = symmetric(np.sign(roots) * roots**2, [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)])
     if geodetic:
-        return _log(times, *np.radians(p[:, :2]).T, p[:, 2], P)
-    world = "ECEF" if places.startswith("x") else ENU
-    T, note = transforms(np.tile(np.eye(3), (len(p), 1, 1)), p), NOTE.format(world)
-    return Log(times, T, P, SAID | {"axes": "world"}, (note,), oriented=False, world=world)
+        return on_earth(times, p, P)
+    world = "ECEF" if places.startswith("x") else "east, north and up"
+    T, notes = transforms(np.tile(np.eye(3), (len(p), 1, 1)), p), (f"x, y, z are {world}", GPS_TIME)
+    return Log(times, T, P, SAID | {"axes": "world"}, notes, oriented=False, world=world)
 
 
 def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
@@ -73,19 +73,15 @@ def read_novatel(path: Path, lines: Mapping[int, str]) -> Log | None:
     told = {number: line for number, line in below if line[0] != "("}  # units
     expected = "numbers: UTC, week, second, D M S of latitude and of longitude, height"
     values = table_of(path, told, "positions", expected).numbers(expected, range(10))
-    north, east = (_degrees(values[:, k : k + 3]) for k in (3, 6))
+    parts = (values[:, k : k + 3].T for k in (3, 6))
+    north, east = (np.copysign(np.abs(d) + m / 60 + s / 3600, d) for d, m, s in parts)
     times = GPS_EPOCH + WEEK * values[:, 1] + values[:, 2]
-    found = np.radians(north), np.radians(east), values[:, 9]
-    return _log(times, *found, np.empty((0, 6, 6)))
+    return on_earth(times, np.column_stack([north, east, values[:, 9]]), np.empty((0, 6, 6)))
 
 
-def _degrees(parts: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    whole, minutes, seconds = parts.T
-    return np.copysign(np.abs(whole) + minutes / 60 + seconds / 3600, whole)
-
-
-def _log(times: Times, north: Times, east: Times, height: Times, P: np.ndarray) -> Log:
-    """Latitudes and longitudes in radians, and m above the ellipsoid."""
+def on_earth(times: Times, places: Float[np.ndarray, "n 3"], P: np.ndarray) -> Log:
+    """The log of latitudes and longitudes in degrees, and m above the ellipsoid."""
+    north, east, height = *np.radians(places[:, :2]).T, places[:, 2]
     square = FLATTENING * (2 - FLATTENING)
     radius = EQUATOR / np.sqrt(1 - square * np.sin(north) ** 2)
     (cn, sn), (ce, se) = ((np.cos(x), np.sin(x)) for x in (north, east))
@@ -94,4 +90,4 @@ def _log(times: Times, north: Times, east: Times, height: Times, P: np.ndarray) 
     along = (radius + height) * cn
     p = np.column_stack([along * ce, along * se, ((1 - square) * radius + height) * sn])
     T = transforms(np.moveaxis(np.array(axes), (0, 1, 2), (2, 1, 0)), p)
-    return Log(times, T, P, SAID, (NOTE.format(ENU),), oriented=False, world="ECEF")
+    return Log(times, T, P, SAID, (ENU, GPS_TIME), oriented=False, world="ECEF")

@@ -28,7 +28,6 @@ def read(path: Path, lines: Mapping[int, str]) -> Log | None:
     row = f"{kind}, a number, and {count - 1} finite numbers"
     table = table_of(path, told, "vertices", row)
     values = table.numbers(row, range(count), spare=False)
+    values = values[np.argsort(values[:, 0], kind="stable")]
     found = planar(table, values, "s") if kind == _PLANAR else log(table, values, unit="s")
-    order = np.argsort(found.times, kind="stable")
-    times, poses = found.times[order], found.poses[order]
-    return found._replace(times=times, poses=poses, notes=(NOTE,), stamped=False)
+    return found._replace(notes=(*found.notes, NOTE), stamped=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -19,7 +19,11 @@ STEPS = (1e-3, 10.0)
 """The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
 """The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
+ROS = {"error": "split", "axes": "world"}
+"""The convention of PoseWithCovariance, as ROS documents it."""
 WHOLE = "a covariance of finite numbers, or of NaN alone (an unknown axis has the variance −1)"
+TAKEN = "no title says the unit of its angles: they are taken as {}"
+DEGREE = np.pi / 180
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
 _SINCE = (1e8, 4e9)
@@ -55,15 +59,14 @@ class Log(NamedTuple):
     body: str = ""
     assumed: bool = False
     """Whether the words of its convention are, as its titles say none."""
+    otherwise: Stack = np.empty(0)
+    """The poses if angles were in degrees, or in radians, where no title says which; or none."""
 
 
 def log(
-    table: Table,
-    rows: Rows,
-    P: Rows | None = None,
-    said: Mapping[str, str] = NOTHING,
+    table: Table, rows: Rows, P: Rows | None = None, said: Mapping[str, str] = NOTHING,
     unit: str = "",
-) -> Log:
+) -> Log:  # fmt: skip
     """A log of rows `t tx ty tz qx qy qz qw`, or of positions alone, `t tx ty tz`. Rows that are
     all NaN but for the time have no pose.
 
@@ -81,10 +84,42 @@ def log(
     return Log(times, T, P, said, notes, oriented=oriented)
 
 
-def planar(table: Table, rows: Rows, unit: str = "") -> Log:
-    """A log of rows `t x y θ`."""
+def planar(table: Table, rows: Rows, unit: str = "", title: str = "") -> Log:
+    """A log of rows `t x y θ`, whose title may say the unit of θ."""
     times, notes = in_seconds(table, rows[:, 0], unit)
-    return Log(times, of_xytheta(rows[:, 1:]), np.empty((0, 3, 3)), notes=notes)
+
+    def of(angle: Rows) -> Log:
+        T = of_xytheta(np.column_stack([rows[:, 1:3], angle]))
+        return Log(times, T, np.empty((0, 3, 3)), notes=notes)
+
+    return of_angles(of, rows[:, 3:], rows[:, 1:3], title)
+
+
+def of_angles(of: Callable[[Rows], Log], angles: Rows, places: Rows, title: str) -> Log:
+    """The log `of` angles in radians; they are in what a title says, or else by `in_degrees`."""
+    told = re.search("deg|rad", title.lower())
+    degrees = told[0] == "deg" if told else in_degrees(angles, places)
+    first, other = (of(angles * x) for x in ((DEGREE, 1.0) if degrees else (1.0, DEGREE)))
+    said = [TAKEN.format("degrees")] if degrees and not told else []
+    otherwise = first.otherwise if told else other.poses
+    return first._replace(otherwise=otherwise, notes=(*first.notes, *said))
+
+
+def in_degrees(angles: Rows, places: Rows) -> bool:
+    """Whether angles, the yaw first, are degrees: only so the heading is along the course,
+    forwards or backwards, which turns; or as radians they would leap by half a turn."""
+    there = np.isfinite(angles).all(axis=1) & np.isfinite(places).all(axis=1)
+    a, p = angles[there], places[there]
+    largest, leap = np.abs(a).max(initial=0.0), np.abs(np.diff(a, axis=0)).max(initial=0.0)
+    every = max(len(a) // 200, 1)
+    along = (p[every:] - p[:-every]) @ [1, 1j]
+    yaw, length = a[every // 2 :][: len(along), 0], max(float(np.abs(along).sum()), 1e-9)
+    still, radians, degrees = (
+        abs(np.sum(np.abs(along) * np.exp(2j * (x * yaw - np.angle(along))))) / length
+        for x in (0.0, 1.0, DEGREE)
+    )
+    by_course = still < 0.9 and max(radians, degrees) > 0.95
+    return bool(degrees > radians if by_course else largest > 2 * np.pi + 0.1 and leap > np.pi)
 
 
 def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple[str, ...]]:

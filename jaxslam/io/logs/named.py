@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 
 from jaxslam._runtime.files import LARGEST
+from jaxslam.io.logs.geodetic import ENU, on_earth
 from jaxslam.io.logs.log import (
+    DEGREE,
     MIXED,
     NOTHING,
+    ROS,
     Log,
+    Rows,
     Stack,
     Words,
+    in_seconds,
     log,
+    of_angles,
     planar,
     symmetric_or_none,
     unit_in,
@@ -28,6 +35,8 @@ _PLACED = dict(zip(("x", "y", "z", "east", "north", "up", *"012"), 3 * "xyz", st
 _TURNED = dict(zip("xyzwijk0123", "xyzwxyzwxyz", strict=True))
 _ANGLES = {**dict.fromkeys(("θ", "theta", "yaw", "heading", "th", "psi"), "θ"),
            "roll": "roll", "phi": "roll", "pitch": "pitch"}  # fmt: skip
+_EARTH = {"latitude": "north", "lat": "north", "longitude": "east", "lon": "east", "lng": "east",
+          "altitude": "height", "alt": "height", "height": "height"}  # fmt: skip
 _OTHERS = {"twist", "vel", "velocity", "linear", "angular", "acc", "acceleration", "bias"}
 _TIME = re.compile(
     r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?|timestamp_sample)"
@@ -42,12 +51,10 @@ _SPREAD = re.compile(
 _ORDER = {"x": 0, "y": 1, "z": 2, **dict.fromkeys(("roll", "phi", "rx", "r"), 3),
           **dict.fromkeys(("pitch", "ry", "p"), 4)}  # fmt: skip
 """The places of axes in a covariance; any other is the yaw."""
-_ROS = {"error": "split", "axes": "world"}
 _ERRORS = {
-    "type1": {"error": "right", "axes": "body"},
-    "type2": {"error": "left", "axes": "world"},
+    "type1": {"error": "right", "axes": "body"}, "type2": {"error": "left", "axes": "world"},
     "type5": MIXED,
-}
+}  # fmt: skip
 """What cnspy calls the error of a covariance, in its column `est_err_type`."""
 
 
@@ -57,8 +64,9 @@ def read(table: Table) -> Log | None:
     from scipy.spatial.transform import Rotation  # slow to import
 
     named, rows = meanings(table.titles), table.rows
-    flat = "z" not in named
-    if not {"t", "x", "y"} <= named.keys() or (flat and "θ" not in named):
+    earth = {*_EARTH.values()} <= named.keys() and "x" not in named
+    flat = "z" not in named and not earth
+    if not ({"t", "x", "y"} <= named.keys() or earth) or (flat and "θ" not in named):
         return None
     titles = {name: table.titles[i] for name, i in named.items()}
     expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
@@ -66,25 +74,34 @@ def read(table: Table) -> Log | None:
     if "nano" in named and rows[:, named["nano"]].max() < 1e9:
         times, unit = times + 1e-9 * table.numbers(expected, [named["nano"]]), "s"
     P, said, assumed = covariances(table, flat=flat)
+    if earth:
+        P = np.empty((0, 6, 6)) if P is None or not P[:, :3, :3].any() else P
+        P[:, 3:, 3:] = 0.0  # of positions; all is zero where a receiver knows none
+        P[~P.any(axis=(1, 2))] = np.nan
+        places = [named[x] for x in ("t", "north", "east", "height")]
+        place = table.numbers(expected, places, none=True)[:, 1:]
+        place[:, :2] /= DEGREE if "rad" in titles["north"].lower() else 1.0
+        times, notes = in_seconds(table, times[:, 0], unit)
+        return on_earth(times, place, P)._replace(notes=(ENU, *notes))
     if flat:
         found = table.numbers(expected, [named[x] for x in "xyθ"])
-        found[:, 2] *= _radians(titles["θ"])
-        found = planar(table, np.column_stack([times, found]), unit)
+        found = planar(table, np.column_stack([times, found]), unit, titles["θ"])
         return found if P is None else found._replace(covariances=P, said=said)
     turns = rows[:, [named[x] for x in ("qx", "qy", "qz", "qw") if x in named]]
+    places = rows[:, [named[x] for x in "xyz"]]
+
+    def of(turns: Rows) -> Log:
+        found = log(table, np.column_stack([times, places, turns]), P, said, unit)
+        return found._replace(assumed=assumed)
+
     if turns.shape[1] < 4 and {"roll", "pitch", "θ"} <= named.keys():
-        yaw_pitch_roll = rows[:, [named[x] for x in ("θ", "pitch", "roll")]]
-        unit_of_angles = _radians("".join(titles.values()))
-        turns = Rotation.from_euler("ZYX", unit_of_angles * yaw_pitch_roll).as_quat()
+        order = ("θ", "pitch", "roll")
+        angles, title = rows[:, [named[x] for x in order]], "".join(titles[x] for x in order)
+        by_angles = partial(Rotation.from_euler, "ZYX")
+        return of_angles(lambda x: of(by_angles(x).as_quat()), angles, places[:, :2], title)
     if P is not None and not turns.shape[1]:
         P[~np.isnan(P[:, 0, 0]), 3:, 3:] = 0.0
-    places = rows[:, [named[x] for x in "xyz"]]
-    found = log(table, np.column_stack([times, places, turns]), P, said, unit)
-    return found._replace(assumed=assumed)
-
-
-def _radians(title: str) -> float:
-    return np.pi / 180 if "deg" in title.lower() else 1.0
+    return of(turns)
 
 
 def words(title: str) -> str:
@@ -120,7 +137,7 @@ def _of_pose(told: str, turns: Collection[str]) -> str:
             return f"q{_TURNED[axis]}"
         if word in _PLACES and axis in _PLACED and (word or not axis.isdigit()):
             return _PLACED[axis]
-    return _ANGLES.get(last, "")
+    return _ANGLES.get(last, _EARTH.get(last, ""))
 
 
 def _spread(told: str) -> re.Match[str] | None:
@@ -153,12 +170,12 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
         place = place or next(places, (6, 6))
         if flat and max(place) < 5:  # of x, y and yaw
             place = [5 if x > 1 else x for x in place]
-        unit = _radians(table.titles[i]) if len(names) == 1 else 1.0
+        unit = DEGREE if len(names) == 1 and "deg" in table.titles[i].lower() else 1.0
         column = unit * np.clip(table.rows[:, i], -LARGEST, LARGEST)  # whose square is finite
         cells[place[0], place[-1]] = column ** (2 if found["sigma"] else 1)
         if {"roll", "pitch"} & {*names}:
             axes = {"error": "split", "axes": "rpy"}
-        axes = _ROS if found["cov"] and not names else axes
+        axes = ROS if found["cov"] and not names else axes
     cells.pop((6, 6), None)
     if not {(i, i) for i in range(3 - flat)} <= cells.keys():
         return None, NOTHING, False
@@ -166,7 +183,7 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
     for i in {*range(6)} - {i for i, j in cells if i == j}:
         P[~np.isnan(P[:, 0, 0]), i, i] = -1.0
     if flat:
-        return P[:, [[0], [1], [5]], [0, 1, 5]], _ROS, False
+        return P[:, [[0], [1], [5]], [0, 1, 5]], ROS, False
     column = table.titles.index("est_err_type") if "est_err_type" in table.titles else -1
     kinds = {*table.words.get(column, ())}
     if len(kinds) > 1 or not kinds <= _ERRORS.keys():

@@ -8,7 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, NOTHING, Log, log, planar, symmetric, symmetric_or_none
+from jaxslam.io.logs.log import (
+    MIXED,
+    NOTHING,
+    Log,
+    in_seconds,
+    log,
+    planar,
+    symmetric,
+    symmetric_or_none,
+)
 from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, transforms
 
@@ -40,29 +49,34 @@ def _tum(table: Table) -> Log:
     return log(table, rows, P, MIXED if count == 20 else NOTHING)
 
 
-def _planar(table: Table) -> Log:
-    return planar(table, table.numbers("four finite numbers t x y θ (s, m, rad)"))
+_KITTI, _PLANAR = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)", "four finite numbers t x y θ"
 
 
-_KITTI = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)"
+def _kitti(table: Table) -> Log | None:
+    """Lines of 12 numbers of T_wc; or of a time, and these or all 16, by rows or columns (ARKit).
 
-
-def _kitti(table: Table) -> Log:
-    """Times are those of `times.txt` beside it, else the number of the line, from 0."""
-    rows = table.numbers(_KITTI)
-    T = transforms(*np.split(rows.reshape(-1, 3, 4), [3], axis=2))
+    Times are those of `times.txt` beside 12, else the number of the line, from 0."""
+    if (count := table.rows.shape[1]) not in (12, 13, 17):
+        return None
+    M = table.rows[:, count % 4 :].reshape(len(table.rows), -1, 4)
+    M = np.swapaxes(M, 1, 2) if M.shape[1] == 4 and (M[:, :3, 3] == 0).all() else M
+    if (M[:, 3:] != [0, 0, 0, 1]).any():
+        return None
+    table.numbers(_KITTI)
+    T = transforms(*np.split(M[:, :3], [3], axis=2))
     table.check(not_rigid(T, 1e-3), f"a rigid motion [R t] with a rotation R, {_KITTI}")
     left, _, right = np.linalg.svd(T[:, :3, :3])  # rounding to six digits, taken away
     T[:, :3, :3] = left @ right
+    if count > 12:
+        times, notes = in_seconds(table, table.rows[:, 0])
+        return Log(times, T, np.empty((0, 6, 6)), notes=notes)
     beside = table.path.parent / "times.txt"
     if not beside.is_file():
         return Log(np.arange(float(len(T))), T, np.empty((0, 6, 6)), stamped=False)
     times = read_table(beside, "times", "times", "finite times in seconds")
     seconds = times.numbers("finite times in seconds", [0])[:, 0]
     if len(seconds) != len(T):
-        raise ValueError(
-            f"{beside} has {len(seconds)} times for the {len(T)} poses of {table.path}"
-        )
+        raise ValueError(f"{beside} has {len(seconds)} times for {len(T)} poses of {table.path}")
     return Log(seconds, T, np.empty((0, 6, 6)))
 
 
@@ -87,9 +101,8 @@ def is_deviations(rows: Float[np.ndarray, "n k"]) -> bool:
 def _of_cameras(count: np.ndarray, each: int, more: tuple[int, ...]) -> tuple[int, ...]:
     """How many numbers may be behind the `count` of the cameras."""
     n = count[0]
-    if not (np.isfinite(n) and n == round(n) and n >= 0):
-        return ()
-    return tuple(each * int(n) + x for x in more)
+    whole = np.isfinite(n) and n == round(n) and n >= 0
+    return tuple(each * int(n) + x for x in more) if whole else ()
 
 
 def _w_first(table: Table) -> Log | None:
@@ -107,13 +120,18 @@ def _w_first(table: Table) -> Log | None:
 
 
 _STAMPED = {7: "t x y z roll pitch yaw", 9: "sec nsec x y z qx qy qz qw"}
+_STAMPED[17] = (
+    f"sec nsec status service lat lon alt {' '.join(f'covariance{i}' for i in range(9))} type"
+)
 _STAMPED[45] = _STAMPED[87] = f"{_STAMPED[9]} {' '.join(f'covariance{i}' for i in range(36))}"
-"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist."""
+"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist or of
+NavSatFix."""
 
 
 def _as_titled(table: Table) -> Log | None:
     """Lines of these numbers, and maybe of frames, by their titles."""
-    rows = np.delete(table.rows, [*table.words], axis=1)
+    blank = [2] if np.isnan(table.rows[:, 2:3]).all() else []  # a frame without a name
+    rows = np.delete(table.rows, [*table.words, *blank], axis=1)
     titles = tuple(_STAMPED.get(rows.shape[1], "").split())
     whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.hypot.reduce(rows[:, 3:7], axis=1)
     # No whole seconds and nanoseconds; or a quaternion, without a time.
@@ -130,13 +148,11 @@ def _positions(table: Table) -> Log:
 
 FORMATS: tuple[tuple[str, Reader], ...] = (
     ("sec nsec x y z qx qy qz qw and maybe ROS' covariance; t x y z roll pitch yaw", _as_titled),
+    ("KITTI, 12 numbers, or 13 and 17 with a time", _kitti),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
-    ("TUM, 8 numbers", _of(8, _tum)),
-    ("t x y θ", _of(4, _planar)),
-    ("KITTI, 12 numbers", _of(12, _kitti)),
-    ("t x y z and a triangle, 10 numbers", _of(10, _positions)),
-    ("OpenVINS's states", _state),
+    ("TUM, 8 numbers", _of(8, _tum)), ("t x y θ", _of(4, lambda x: planar(x, x.numbers(_PLANAR)))),
+    ("t x y z and a triangle, 10 numbers", _of(10, _positions)), ("OpenVINS's states", _state),
     ("OpenVINS's pose_to_file, 20 numbers", _of(20, _tum)),
     ("TUM and a triangle, 29 numbers", _of(29, _tum)),
     ("TUM and a covariance, 44 numbers", _of(44, _tum)),
-)
+)  # fmt: skip
