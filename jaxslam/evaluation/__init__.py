@@ -16,7 +16,19 @@ from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nee
 from jaxslam.evaluation.scale import errors_beyond_scale
 
 __all__ = [
-    "CHOICES", "Convention", "Evaluation", "Identification", "advice", "converted",
-    "errors_beyond_scale", "evaluate", "evaluate_log", "evaluate_nees", "evaluate_poses",
-    "pose_errors", "read_covariances", "read_pose_log", "write_covariances",
-]  # fmt: skip
+    "CHOICES",
+    "Convention",
+    "Evaluation",
+    "Identification",
+    "advice",
+    "converted",
+    "errors_beyond_scale",
+    "evaluate",
+    "evaluate_log",
+    "evaluate_nees",
+    "evaluate_poses",
+    "pose_errors",
+    "read_covariances",
+    "read_pose_log",
+    "write_covariances",
+]

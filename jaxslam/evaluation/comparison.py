@@ -58,11 +58,17 @@ def stated_errors(poses: Poses) -> tuple[PerAxis, Squares, Mask, dict[str, Any]]
         told = "if errors of different poses correlate, σ of a right filter may seem too large, or"
         notes += (f"{told} too small by up to {by:.2f}",)
     words = {
-        "quantity": "NEES", "times": step_times(None, len(logged[0]))[start:], "timed": False,
-        "names": tuple(poses.names[i] for i in poses.axes), "convention": poses.convention,
-        "alignment": poses.align, "notes": notes, "scale": scale, "truth_sigma": poses.truth_sigma,
+        "quantity": "NEES",
+        "times": step_times(None, len(logged[0]))[start:],
+        "timed": False,
+        "names": tuple(poses.names[i] for i in poses.axes),
+        "convention": poses.convention,
+        "alignment": poses.align,
+        "notes": notes,
+        "scale": scale,
+        "truth_sigma": poses.truth_sigma,
         "most": most if by > 1 else None,
-    }  # fmt: skip
+    }
     return e, P, poses.logged, words
 
 

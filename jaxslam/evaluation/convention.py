@@ -62,9 +62,11 @@ Result = TypeVar("Result")
 BLOCK = 8192
 """The poses whose matrices are computed at once."""
 CHOICES = {
-    "error": ("right", "left", "split"), "axes": ("body", "world", "mixed", "rpy"),
-    "order": ("position-first", "rotation-first"), "scale": ("marginal", "given"),
-}  # fmt: skip
+    "error": ("right", "left", "split"),
+    "axes": ("body", "world", "mixed", "rpy"),
+    "order": ("position-first", "rotation-first"),
+    "scale": ("marginal", "given"),
+}
 NATURAL_AXES = {"right": "body", "left": "world", "split": "world"}
 """The default axes of an error; of `split` those of ROS."""
 _OWN_AXES = {"right": ("body", "body"), "left": ("world", "world"), "split": ("world", "body")}
@@ -281,9 +283,14 @@ class CovarianceText(NamedTuple):
 
 
 def write_covariances(
-    path: str | Path, times: ArrayLike, covariances: ArrayLike, convention: Convention, *,
-    length: str = "m", remark: str = "",
-) -> None:  # fmt: skip
+    path: str | Path,
+    times: ArrayLike,
+    covariances: ArrayLike,
+    convention: Convention,
+    *,
+    length: str = "m",
+    remark: str = "",
+) -> None:
     """Write times (n,) in seconds and covariances (n, 6, 6), of m and rad, whole or not at all.
 
     `length` names another unit of length, in one word; the `remark` is for people.

@@ -160,9 +160,10 @@ class Identification:
 
 
 def identify(
-    stated: Convention, tried: Mapping[Convention, Tried],
+    stated: Convention,
+    tried: Mapping[Convention, Tried],
     given: Callable[[], Mapping[Convention, Tried]] = dict,
-) -> Identification:  # fmt: skip
+) -> Identification:
     """The convention from the NEES that each of them gives, of the same runs.
 
     Those `given` the scale are tried where none of the others makes the data consistent.

@@ -47,12 +47,20 @@ Runs = tuple[RunFiles, ...]
 
 
 def evaluate_log(
-    source: str | Path, *, covariance: str | Path | None = None, truth: str | Path | None = None,
-    estimate: str | None = None, stated: Mapping[str, str] | None = None, align: str = "none",
-    axes_used: str | Sequence[str] = (), nis: bool = False,
-    truth_sigma: Sequence[float] | None = None, innovations: str | Path | None = None,
-    time_offset: float | str = 0.0, against: str | Path | None = None,
-) -> Evaluation:  # fmt: skip
+    source: str | Path,
+    *,
+    covariance: str | Path | None = None,
+    truth: str | Path | None = None,
+    estimate: str | None = None,
+    stated: Mapping[str, str] | None = None,
+    align: str = "none",
+    axes_used: str | Sequence[str] = (),
+    nis: bool = False,
+    truth_sigma: Sequence[float] | None = None,
+    innovations: str | Path | None = None,
+    time_offset: float | str = 0.0,
+    against: str | Path | None = None,
+) -> Evaluation:
     """The verdict on what a file or a folder holds.
 
     `source` is a file of arrays (npz, mat), a table of `run, step, errors, upper triangle` lines, a
@@ -239,9 +247,13 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _of_runs(
-    source: Path, runs: Runs, stated: dict[str, str], how: Options, time_offset: float | str,
+    source: Path,
+    runs: Runs,
+    stated: dict[str, str],
+    how: Options,
+    time_offset: float | str,
     against: bool,
-) -> Evaluation:  # fmt: skip
+) -> Evaluation:
     """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
     `how` are the options of `evaluate_poses`; for the others see `evaluate_log`.

@@ -23,11 +23,16 @@ from jaxslam.io.text import vector_of
 
 
 def evaluate_poses(
-    estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike,
-    convention: Convention | None = None, *, align: str = "none",
-    axes_used: str | Sequence[str] = (), times: ArrayLike | None = None,
+    estimates: ArrayLike,
+    covariances: ArrayLike,
+    truths: ArrayLike,
+    convention: Convention | None = None,
+    *,
+    align: str = "none",
+    axes_used: str | Sequence[str] = (),
+    times: ArrayLike | None = None,
     truth_sigma: Sequence[float] | None = None,
-) -> Evaluation:  # fmt: skip
+) -> Evaluation:
     """The verdict on a filter from its poses T_wc, m, and the true ones.
 
     `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 6) of x, y, z and a rotation

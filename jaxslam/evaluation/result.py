@@ -509,9 +509,13 @@ def _in_columns(*rows: tuple[str, ...]) -> list[str]:
 
 
 def evaluate(
-    errors: ArrayLike, covariances: ArrayLike, *, times: ArrayLike | None = None,
-    names: Sequence[str] = (), quantity: str = "NEES",
-) -> Evaluation:  # fmt: skip
+    errors: ArrayLike,
+    covariances: ArrayLike,
+    *,
+    times: ArrayLike | None = None,
+    names: Sequence[str] = (),
+    quantity: str = "NEES",
+) -> Evaluation:
     """The verdict on a filter from its errors and their covariances.
 
     `errors` are (runs, steps, n) and `covariances` (runs, steps, n, n); with `quantity="NIS"` they
@@ -532,20 +536,28 @@ def evaluate(
     start, logged, notes = without_known(e, P, logged)
     P = filled(P[:, start:], logged[:, start:], np.eye(e.shape[-1]))
     return of_steps(
-        e[:, start:], P, logged[:, start:], quantity=quantity,
-        times=step_times(times, e.shape[1])[start:], timed=times is not None,
-        names=_names(names, e.shape[-1]), notes=notes,
-    )  # fmt: skip
+        e[:, start:],
+        P,
+        logged[:, start:],
+        quantity=quantity,
+        times=step_times(times, e.shape[1])[start:],
+        timed=times is not None,
+        names=_names(names, e.shape[-1]),
+        notes=notes,
+    )
 
 
 def of_steps(errors: PerAxis, P: Squares, logged: Mask, **words: Any) -> Evaluation:
     """The evaluation of errors and their covariances at the steps that were logged."""
     z = whitened(errors, P)
     return Evaluation(
-        dof=errors.shape[-1], nees=filled(squared(z), logged, np.nan),
-        whitened=filled(z, logged, np.nan), errors=filled(errors, logged, np.nan),
-        sigmas=filled(sigmas(P), logged, np.nan), **words,
-    )  # fmt: skip
+        dof=errors.shape[-1],
+        nees=filled(squared(z), logged, np.nan),
+        whitened=filled(z, logged, np.nan),
+        errors=filled(errors, logged, np.nan),
+        sigmas=filled(sigmas(P), logged, np.nan),
+        **words,
+    )
 
 
 def evaluate_nees(
@@ -575,10 +587,17 @@ def evaluate_nees(
     none = np.empty((*values.shape, 0))
     values, one, notes = of_one_dof(values, each)
     return Evaluation(
-        quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))), dof=one,
-        nees=values, errors=none, sigmas=none, times=step_times(times, values.shape[1]),
-        timed=times is not None, names=(), notes=notes, whitened=none,
-    )  # fmt: skip
+        quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
+        dof=one,
+        nees=values,
+        errors=none,
+        sigmas=none,
+        times=step_times(times, values.shape[1]),
+        timed=times is not None,
+        names=(),
+        notes=notes,
+        whitened=none,
+    )
 
 
 def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:

@@ -111,11 +111,16 @@ class Scale:
         (low, high), median, sigma = self.over_runs
         rms, in_sigma = json_numbers(np.array([self.rms, self.factor]))
         return {
-            "log_scale": json_numbers(self.log_scale), "drift": json_numbers(median),
-            "drift95": [json_numbers(low), json_numbers(high)], "sigma": json_numbers(sigma),
-            "drift_rms": rms, "drift_in_sigma": in_sigma, "fitted": self.fitted,
-            "verdict": self.verdict, "disproved": self.disproved,
-        }  # fmt: skip
+            "log_scale": json_numbers(self.log_scale),
+            "drift": json_numbers(median),
+            "drift95": [json_numbers(low), json_numbers(high)],
+            "sigma": json_numbers(sigma),
+            "drift_rms": rms,
+            "drift_in_sigma": in_sigma,
+            "fitted": self.fitted,
+            "verdict": self.verdict,
+            "disproved": self.disproved,
+        }
 
 
 def at_one_scale(poses: Poses) -> tuple[PerAxis, Squares, Scale]:

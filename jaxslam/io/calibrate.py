@@ -152,10 +152,14 @@ def write(calibrated: Calibrated, board: Board, out: str | Path) -> None:
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     write_calibration(
-        out / "calibration.json", calibrated.calibration,
-        sigma={"distortion": list(calibrated.distortion_sigma)}, reprojection_rms=calibrated.rms,
-        views=len(calibrated.views), coverage=calibrated.coverage, board=asdict(board),
-    )  # fmt: skip
+        out / "calibration.json",
+        calibrated.calibration,
+        sigma={"distortion": list(calibrated.distortion_sigma)},
+        reprojection_rms=calibrated.rms,
+        views=len(calibrated.views),
+        coverage=calibrated.coverage,
+        board=asdict(board),
+    )
     with write_atomically(out / "coverage.png") as path:
         cv2.imwrite(str(path), drawn_coverage(calibrated))
 

@@ -13,8 +13,10 @@ from jaxslam._runtime.files import Json, write_json
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _KEYS = ("width", "height", *INTRINSICS)
 MODELS = {
-    "pinhole": "k1 k2 p1 p2 k3", "rational": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4",
-}  # fmt: skip
+    "pinhole": "k1 k2 p1 p2 k3",
+    "rational": "k1 k2 p1 p2 k3 k4 k5 k6",
+    "fisheye": "k1 k2 k3 k4",
+}
 """The numbers of every model's lens, in order (`jaxslam.models.lens`)."""
 GUESSED_FIELD_OF_VIEW = 65.0
 """Degrees along the longer side: between a phone that films and a webcam."""

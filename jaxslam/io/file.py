@@ -83,5 +83,6 @@ def _images(path: Path) -> Iterator[np.ndarray]:
 
 VIDEO = Layout(
     "a video file (" + ", ".join(VIDEO_TYPES) + ")",
-    lambda path: path.is_file() and path.suffix.lower() in VIDEO_TYPES, _open,
-)  # fmt: skip
+    lambda path: path.is_file() and path.suffix.lower() in VIDEO_TYPES,
+    _open,
+)

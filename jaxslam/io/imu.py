@@ -224,9 +224,10 @@ def _increasing(name: str, rows: Rows) -> tuple[Rows, tuple[str, ...]]:
             f"to {whole[i, 0]:.6f}; expected readings of one sensor in order of time"
         )
     left = {
-        "are not finite": count - len(whole), "have the stamp of the one before": int(twice.sum()),
+        "are not finite": count - len(whole),
+        "have the stamp of the one before": int(twice.sum()),
         "have a stamp that goes back": int(back.sum()),
-    }  # fmt: skip
+    }
     rows = whole[~(twice | back)]
     told = tuple(f"{n} of {count} readings {x}, and are left out" for x, n in left.items() if n)
     if len(rows) < 3:

@@ -18,10 +18,11 @@ from jaxslam.io.tum import not_rigid
 _APART = 5.0
 """Times that a density and the scatter of readings may differ by."""
 _DENSITIES = {
-    "gyroscope_noise_density": ("rad/s/√Hz", 0.1), "gyroscope_random_walk": ("rad/s²/√Hz", 0.1),
+    "gyroscope_noise_density": ("rad/s/√Hz", 0.1),
+    "gyroscope_random_walk": ("rad/s²/√Hz", 0.1),
     "accelerometer_noise_density": ("m/s²/√Hz", 1.0),
     "accelerometer_random_walk": ("m/s³/√Hz", 1.0),
-}  # fmt: skip
+}
 """Kalibr's names of the densities, their units, and more than any sensor has."""
 _CAMERAS = {"T_cam_imu": False, "T_imu_cam": True}
 """Names of T_CI, and of its inverse."""

@@ -27,10 +27,17 @@ WIDEST = 1280
 
 
 def open_source(
-    path: str | Path, *, calibration: str | Path | None = None, fov: float | None = None,
-    reference: str | Path | None = None, rate: float = 30.0, start: float = 0.0, every: int = 1,
-    frames: int | None = None, scale: float | None = None,
-) -> Source:  # fmt: skip
+    path: str | Path,
+    *,
+    calibration: str | Path | None = None,
+    fov: float | None = None,
+    reference: str | Path | None = None,
+    rate: float = 30.0,
+    start: float = 0.0,
+    every: int = 1,
+    frames: int | None = None,
+    scale: float | None = None,
+) -> Source:
     """The video at `path`, in the first of `LAYOUTS` that recognises it.
 
     `calibration` (JSON, or of another program), `fov` (horizontal field of view, degrees) and

@@ -60,9 +60,12 @@ class Layout(NamedTuple):
 
 
 def of_files(
-    path: Path, files: list[Path], times: Float[np.ndarray, " n"],
-    calibration: Calibrator | None = None, reference: Trajectory | None = None,
-) -> Recording:  # fmt: skip
+    path: Path,
+    files: list[Path],
+    times: Float[np.ndarray, " n"],
+    calibration: Calibrator | None = None,
+    reference: Trajectory | None = None,
+) -> Recording:
     """A recording of image files of the folder `path`.
 
     Its `calibration.json`, where it has one, is better than what the layout says.
@@ -241,9 +244,10 @@ def _open_timestamped(path: Path, _rate: float) -> Recording:
 
 
 TIMESTAMPED = Layout(
-    "a folder with images/ and timestamps.txt", lambda path: (path / "timestamps.txt").is_file(),
+    "a folder with images/ and timestamps.txt",
+    lambda path: (path / "timestamps.txt").is_file(),
     _open_timestamped,
-)  # fmt: skip
+)
 PLAIN = Layout(
     "a folder of images", lambda path: path.is_dir() and bool(image_files(path)), _open_plain
 )

@@ -26,10 +26,11 @@ _SAME = {
 """Encodings by other names; those of planes begin with that of brightness."""
 _COLOURS, _MOSAICS = ("bgr", "rgb", "bgra", "rgba"), ("rggb", "bggr", "gbrg", "grbg")
 _GREY = {
-    "mono": (1, None), **{x: (len(x), getattr(cv2, f"COLOR_{x.upper()}2GRAY")) for x in _COLOURS},
+    "mono": (1, None),
+    **{x: (len(x), getattr(cv2, f"COLOR_{x.upper()}2GRAY")) for x in _COLOURS},
     **{f"bayer_{x}": (1, getattr(cv2, f"COLOR_Bayer{x.upper()}2GRAY")) for x in _MOSAICS},
     **{x: (2, getattr(cv2, f"COLOR_YUV2GRAY_{x.upper()}")) for x in ("uyvy", "yuy2")},
-}  # fmt: skip
+}
 """Numbers of a pixel by encoding, before its bits, and how OpenCV makes them grey."""
 _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _ACCEPTED = f"{', '.join(_GREY)} of 8 or 16 bits, {', '.join(_SAME)}"

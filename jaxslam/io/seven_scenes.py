@@ -53,5 +53,6 @@ def _pose(path: Path) -> np.ndarray:
 
 SEVEN_SCENES = Layout(
     "7-Scenes (frame-XXXXXX.color.png)",
-    lambda path: path.is_dir() and any(path.glob(f"frame-*{PICTURE}")), _open,
-)  # fmt: skip
+    lambda path: path.is_dir() and any(path.glob(f"frame-*{PICTURE}")),
+    _open,
+)

@@ -99,10 +99,12 @@ def selected(
     stop = None if frames is None else first + every * frames
     images = source.images
     return replace(
-        source, times=source.times[first:stop:every],
+        source,
+        times=source.times[first:stop:every],
         images=lambda: itertools.islice(images(), first, stop, every),
-        first=source.first + first * source.every, every=source.every * every,
-    )  # fmt: skip
+        first=source.first + first * source.every,
+        every=source.every * every,
+    )
 
 
 def resized(source: Source, factor: float) -> Source:

@@ -13,9 +13,11 @@ from jaxslam.io.logs.log import Log
 from jaxslam.io.text import table_of, text_lines
 
 FORMATS = (
-    ("SQUARE of smfeval", square.read), ("RTKLIB's .pos", geodetic.read_rtklib),
-    ("titles such as t,tx,ty,tz,qx,qy,qz,qw", named.read), *unnamed.FORMATS,
-)  # fmt: skip
+    ("SQUARE of smfeval", square.read),
+    ("RTKLIB's .pos", geodetic.read_rtklib),
+    ("titles such as t,tx,ty,tz,qx,qy,qz,qw", named.read),
+    *unnamed.FORMATS,
+)
 """What a format is called, and what reads a table of it, or returns None."""
 
 

@@ -64,9 +64,12 @@ class Log(NamedTuple):
 
 
 def log(
-    table: Table, rows: Rows, P: Rows | None = None, said: Mapping[str, str] = NOTHING,
+    table: Table,
+    rows: Rows,
+    P: Rows | None = None,
+    said: Mapping[str, str] = NOTHING,
     unit: str = "",
-) -> Log:  # fmt: skip
+) -> Log:
     """A log of rows `t tx ty tz qx qy qz qw`, or of positions alone, `t tx ty tz`. Rows that are
     all NaN but for the time have no pose.
 

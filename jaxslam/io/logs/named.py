@@ -35,8 +35,16 @@ _PLACED = dict(zip(("x", "y", "z", "east", "north", "up", *"012"), 3 * "xyz", st
 _TURNED = dict(zip("xyzwijk0123", "xyzwxyzwxyz", strict=True))
 _ANGLES = {**dict.fromkeys(("θ", "theta", "yaw", "heading", "th", "psi"), "θ"),
            "roll": "roll", "phi": "roll", "pitch": "pitch"}  # fmt: skip
-_EARTH = {"latitude": "north", "lat": "north", "longitude": "east", "lon": "east", "lng": "east",
-          "altitude": "height", "alt": "height", "height": "height"}  # fmt: skip
+_EARTH = {
+    "latitude": "north",
+    "lat": "north",
+    "longitude": "east",
+    "lon": "east",
+    "lng": "east",
+    "altitude": "height",
+    "alt": "height",
+    "height": "height",
+}
 _OTHERS = {"twist", "vel", "velocity", "linear", "angular", "acc", "acceleration", "bias"}
 _TIME = re.compile(
     r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?|timestamp_sample)"
@@ -52,9 +60,10 @@ _ORDER = {"x": 0, "y": 1, "z": 2, **dict.fromkeys(("roll", "phi", "rx", "r"), 3)
           **dict.fromkeys(("pitch", "ry", "p"), 4)}  # fmt: skip
 """The places of axes in a covariance; any other is the yaw."""
 _ERRORS = {
-    "type1": {"error": "right", "axes": "body"}, "type2": {"error": "left", "axes": "world"},
+    "type1": {"error": "right", "axes": "body"},
+    "type2": {"error": "left", "axes": "world"},
     "type5": MIXED,
-}  # fmt: skip
+}
 """What cnspy calls the error of a covariance, in its column `est_err_type`."""
 
 

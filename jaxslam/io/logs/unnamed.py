@@ -150,9 +150,11 @@ FORMATS: tuple[tuple[str, Reader], ...] = (
     ("sec nsec x y z qx qy qz qw and maybe ROS' covariance; t x y z roll pitch yaw", _as_titled),
     ("KITTI, 12 numbers, or 13 and 17 with a time", _kitti),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
-    ("TUM, 8 numbers", _of(8, _tum)), ("t x y θ", _of(4, lambda x: planar(x, x.numbers(_PLANAR)))),
-    ("t x y z and a triangle, 10 numbers", _of(10, _positions)), ("OpenVINS's states", _state),
+    ("TUM, 8 numbers", _of(8, _tum)),
+    ("t x y θ", _of(4, lambda x: planar(x, x.numbers(_PLANAR)))),
+    ("t x y z and a triangle, 10 numbers", _of(10, _positions)),
+    ("OpenVINS's states", _state),
     ("OpenVINS's pose_to_file, 20 numbers", _of(20, _tum)),
     ("TUM and a triangle, 29 numbers", _of(29, _tum)),
     ("TUM and a covariance, 44 numbers", _of(44, _tum)),
-)  # fmt: skip
+)
