@@ -283,7 +283,7 @@ def test_a_body_that_is_off_by_sigma_makes_no_filter_over_confident(runs):
 def test_what_is_possible_is_told_with_the_nees_without_it():
     _, found = benchmark.judged("half angles", 1.0, 7, ONE)
     assert found.headline.startswith("no verdict: estimate and truth may be of two bodies, the cov")
-    assert "with angle=half in their header NEES is" in found.mistakes[1].told
+    assert "with angle=half in their header (g2o) NEES is" in found.mistakes[1].told
     assert not any(x.certain for x in found.mistakes)
 
 
