@@ -80,8 +80,6 @@ class Status(IntEnum):
     """The outcome of an update, the worse the greater."""
 
     OK = 0
-    SOLVER_FAILED = 1
-    """An iteration ended before its goal; the result is what it had."""
     NOT_POSITIVE = 2
     """A covariance is not positive definite: what follows from it means nothing."""
     DIVERGED = 3

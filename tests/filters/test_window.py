@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import close, quick_jit, whole_record
+from scipy.special import gammaln
 from scipy.stats import chi2, norm
 
 from jaxslam.filters.slam import Slam
@@ -452,14 +453,22 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(monkeypatch):
 
 
 def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown():
+    """And of residuals whose variance is known up to a factor, of which none is left."""
     slam, record, *_ = case(*PLANE)
     at = minimum(*PLANE)
     start = jax.tree.map(lambda leaf: leaf[None], started(at.x, at.y))
     given = jax.tree.map(lambda leaf: leaf[0], modes._candidates(start, jnp.ones(1, int)))
     found = quick_jit(lambda *of: modes._minimum(slam, *of))(given, record)
     r, A, _ = dense(slam, record, at.x, at.y)
-    expected = -(r @ r + np.linalg.slogdet(A)[1]) / 2
-    np.testing.assert_allclose(found.evidence, expected, rtol=1e-9)
+    pixels = np.asarray(residuals(slam, record, path(slam, record, at.x), at.y))
+    w, n, a = (pixels**2).sum(), int(record.compared.sum()), modes.WORTH / 2
+    variances = np.exp(np.linspace(-4, 4, 4001))  # by the claimed one
+    of_each = -(n / 2 + a + 1) * np.log(variances) - (w / 2 + a) / variances
+    most = of_each.max()
+    marginal = most + np.log(np.trapezoid(np.exp(of_each - most), variances))
+    certain = -(a + n / 2) * np.log(a) + gammaln(a + n / 2)  # where no residual is left
+    expected = marginal - certain - (r @ r - w + np.linalg.slogdet(A)[1]) / 2
+    np.testing.assert_allclose(found.evidence, expected, rtol=1e-6)
 
 
 def test_what_a_minimum_gains_without_a_landmark_is_foretold():
