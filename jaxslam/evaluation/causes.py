@@ -89,7 +89,7 @@ def explained(found: Evaluation) -> bool:
     """Whether nothing is left to be wrong by the verdict, which may allow for much, nor by what one
     right pose in 200 reaches, upwards or downwards."""
     share = float(scipy.special.chdtr(found.dof, _nees(found)))
-    return not suspect(found) and found.of_nees["word"] not in WORSE and 0.005 < share < 0.995
+    return 0.005 < share < 0.995 and not suspect(found) and found.of_nees["word"] not in WORSE
 
 
 def _nees(found: Evaluation) -> float:
@@ -377,8 +377,8 @@ def _instead_of(
         whole = poses._replace(covariances=change())
         fixed, off = compared(whole), np.abs(_factors(found))
         names = [[x for x in fixed.names if x.startswith("r") == of] for of in (False, True)]
-        parts = [compared(whole._replace(used=tuple(x))) for x in names if x]
-        if not all(map(explained, (fixed, *parts))):
+        parts = [compared(whole._replace(used=tuple(x))) for x in names if x and explained(fixed)]
+        if not parts or not all(map(explained, parts)):
             return None
         # Of one axis the factor scatters; of a filter whose heading is wrong, one axis stands out.
         few = len(poses.logged) < FEWEST
