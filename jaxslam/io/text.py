@@ -117,9 +117,8 @@ def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
 
 def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) -> Table:
     """The same of the lines of a file."""
-    first = next(iter(told.values()), "")
     for mark, (kind, instead) in _OTHERS.items():
-        if re.match(mark, first):
+        if re.match(mark, next(iter(told.values()), "")):
             raise ValueError(f"{path}: is {kind}, which is not read; {instead}")
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
     lines = {n: DATE.sub(ISO, line) for n, line in told.items() if not _is_comment(line)}

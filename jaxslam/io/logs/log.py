@@ -101,11 +101,12 @@ def planar(table: Table, rows: Rows, unit: str = "", title: str = "") -> Log:
 def of_angles(of: Callable[[Rows], Log], angles: Rows, places: Rows, title: str) -> Log:
     """The log `of` angles in radians; they are in what a title says, or else by `in_degrees`."""
     told = re.search("deg|rad", title.lower())
-    degrees = told[0] == "deg" if told else in_degrees(angles, places)
-    first, other = (of(angles * x) for x in ((DEGREE, 1.0) if degrees else (1.0, DEGREE)))
-    said = [TAKEN.format("degrees")] if degrees and not told else []
-    otherwise = first.otherwise if told else other.poses
-    return first._replace(otherwise=otherwise, notes=(*first.notes, *said))
+    unit = DEGREE if (told[0] == "deg" if told else in_degrees(angles, places)) else 1.0
+    first = of(angles * unit)
+    if told:
+        return first
+    notes = first.notes if unit == 1 else (*first.notes, TAKEN.format("degrees"))
+    return first._replace(otherwise=of(angles * (DEGREE / unit)).poses, notes=notes)
 
 
 def in_degrees(angles: Rows, places: Rows) -> bool:
