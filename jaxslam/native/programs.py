@@ -37,7 +37,7 @@ class NativePrograms:
         """
         key, numbers = self._key(fixed, given, runs)
         program = self._made.of(key, partial(self._compiled, key))
-        return lambda count: program(numbers, jax.tree.map(lambda x: x[:count], runs))
+        return lambda count: program(numbers, jax.tree.map(lambda x: np.asarray(x)[:count], runs))
 
     def one(self, fixed: object, given: PyTree, run: PyTree) -> PyTree:
         """The function of one run, for a program of XLA's too: traced once for both."""

@@ -97,6 +97,25 @@ def test_a_program_whose_first_runs_are_others_is_not_believed(pretended, monkey
         np.testing.assert_array_equal(one, other)
 
 
+def test_what_xla_said_of_the_first_runs_is_asked_once(pretended, tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_kept_in", tmp_path)
+    pretended.there = True
+    (slam,) = jaxslam.make_filters(SCENARIO, "robocentric", "inverse_scaling").values()
+
+    def chosen(seed):
+        room, runs = draw(SCENARIO, 12, seed=seed)
+        return backends.chosen("native", NAME, 12, slam, room, SCENARIO.sensor, runs)
+
+    assert chosen(0) == "native"
+    monkeypatch.setattr(backends, "_first_runs", lambda *_: pytest.fail("asked again"))
+    assert chosen(0) == "native"
+    pretended.factor = 1 + 1e-5
+    with pytest.warns(UserWarning, match="since nees differs from XLA"):
+        assert chosen(0) == "xla"
+    with pytest.raises(pytest.fail.Exception, match="asked again"):
+        chosen(1)
+
+
 def test_a_study_is_resumed_by_its_own_backend(pretended, monkeypatch):
     store = MemoryStore()
     assert study(runs=10, store=store, backend="native").backends == {NAME: "native"}
