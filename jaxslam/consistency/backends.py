@@ -16,6 +16,7 @@ from jax.extend.core import Jaxpr
 from jaxtyping import Array, Int, PyTree
 
 from jaxslam._runtime.files import one_line
+from jaxslam._runtime.lookup import lookup
 from jaxslam._runtime.programs import (
     BATCHED,
     QUICK,
@@ -155,8 +156,7 @@ BACKENDS: dict[str, Backend] = {"xla": by_xla, "native": by_native}
 
 def check_backend(backend: str) -> None:
     """Raise ValueError for a backend that is not known."""
-    if backend not in (*BACKENDS, AUTO):
-        raise ValueError(f"unknown backend {backend!r}; known: {', '.join((*BACKENDS, AUTO))}")
+    lookup("backend", [backend], dict.fromkeys((*BACKENDS, AUTO)))
 
 
 def chosen(

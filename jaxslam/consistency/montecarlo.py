@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.lookup import lookup
 from jaxslam._runtime.progress import StudyBar
 from jaxslam._runtime.watchdog import finished
 from jaxslam.consistency.backends import AUTO, BACKENDS, BatchProgram, check_backend, chosen
@@ -371,8 +372,7 @@ def check_sizes(runs: Any, seed: Any, dtype: str, chunk: Any) -> None:
     if not 0 <= seed < 2**63:
         bound = "not be negative" if seed < 0 else "be below 2⁶³"
         raise ValueError(f"seed must {bound}, not {seed}")
-    if dtype not in DTYPES:
-        raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")
+    lookup("dtype", [dtype], dict.fromkeys(DTYPES))
 
 
 _log = logging.getLogger(__name__)

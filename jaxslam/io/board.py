@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from jaxslam._runtime.lookup import lookup
+
 KINDS = ("checkerboard", "charuco")
 _AROUND = 9
 """Side of the neighbourhood of a corner, pixels, in which its edges are looked at."""
@@ -40,8 +42,7 @@ class Board:
     dictionary: str = "5X5_100"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"unknown board {self.kind!r}; known: {', '.join(KINDS)}")
+        lookup("board", [self.kind], dict.fromkeys(KINDS))
         if min(self.columns, self.rows) < 4:
             raise ValueError(
                 f"a board must have at least 4x4 squares, not {self.columns}x{self.rows}"

@@ -18,7 +18,7 @@ from typing import Any
 import equinox as eqx
 
 from jaxslam._numerics.arrays import check_numbers
-from jaxslam._runtime.lookup import suggestion
+from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import GEOMETRIES
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
@@ -127,11 +127,7 @@ def _checked(changes: Mapping[str, Any]) -> dict[str, Value]:
     """Fields in the types that they have. Raises ValueError, naming the field."""
     found = {}
     for name, value in changes.items():
-        if name not in FIELDS:
-            raise ValueError(
-                f"unknown scenario field {name!r}{suggestion(name, FIELDS)}; "
-                f"known: {', '.join(FIELDS)}"
-            )
+        lookup("scenario field", [name], FIELDS)
         found[name] = coerced(name, value, FIELDS[name].default)
         check_numbers(f"scenario field {name}", found[name], FIELDS[name].least)
         word, words = found[name], _WORDS.get(name, ())

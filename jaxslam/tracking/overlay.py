@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
+from jaxslam._runtime.lookup import lookup
 from jaxslam.io.source import Frame
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.patches import Picture
@@ -83,9 +84,7 @@ def draw_overlay(
     in large letters over the picture. Below it are two `notes`, ASCII, and a legend that counts the
     labels, in as many rows as the width asks for. Raises `ValueError` for another label.
     """
-    unknown = sorted(set(table.labels.tolist()) - set(COLOURS))
-    if unknown:
-        raise ValueError(f"unknown label {unknown[0]!r}; known: {', '.join(COLOURS)}")
+    lookup("label", [*COLOURS, *table.labels.tolist()], COLOURS)
     # Less contrast, so that the lines stand out.
     canvas = cv2.cvtColor(cv2.convertScaleAbs(image, alpha=0.75, beta=20), cv2.COLOR_GRAY2BGR)
     for label in COLOURS:
