@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from jaxslam._runtime import plotted
+from jaxslam._runtime.programs import in_background
 from jaxslam.consistency import FolderStore, Study, check_sizes, monte_carlo
 from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import CHUNK, Interruption
@@ -80,6 +83,7 @@ class ConsistencyOptions:
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""
+        in_background(partial(plotted, "plot_consistency"))  # imported while it is computed
         study = self.study()
         study.save(self.out)
         study.plot(self.out / "consistency.png")
