@@ -65,6 +65,8 @@ def cast(tree: T, dtype: DTypeLike) -> T:
         raise ValueError(f"unknown dtype {dtype!r}; known: float64, float32")
 
     def one(leaf):
+        if isinstance(leaf, jax.Array) and leaf.dtype == dtype:
+            return leaf
         if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating):
             return jnp.asarray(leaf, dtype)
         return leaf

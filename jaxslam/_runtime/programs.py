@@ -187,6 +187,9 @@ class Program:
         return _Compiled(compiled, jax.tree.unflatten(structures[-1], after))
 
 
+_name = cache(lambda dtype: dtype.name)  # which NumPy makes anew each time
+
+
 class _Call(NamedTuple):
     """The arguments with which a program is called."""
 
@@ -199,7 +202,7 @@ class _Call(NamedTuple):
         leaves, structure = jax.tree.flatten(args)
         are_arrays = tuple(hasattr(x, "shape") and hasattr(x, "dtype") for x in leaves)
         both = list(zip(leaves, are_arrays, strict=True))
-        kinds = tuple((x.shape, x.dtype.name) if is_array else x for x, is_array in both)
+        kinds = tuple((x.shape, _name(x.dtype)) if is_array else x for x, is_array in both)
         return cls([x for x, is_array in both if is_array], (structure, are_arrays, kinds, wide()))
 
     def arguments(self, arrays: list[PyTree]) -> tuple[PyTree, ...]:

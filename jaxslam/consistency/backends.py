@@ -184,7 +184,7 @@ def chosen(
     few = min(len(runs.visible), FIRST_RUNS if count >= 64 * FIRST_RUNS else 2)
     first = jax.tree.map(lambda x: np.asarray(x)[:few], runs)
     place = place_of("records", (slam, room, sensor, first))
-    wanted = read(*place, dict) if place else None
+    wanted = read(*place, lambda records: records) if place else None
     if able and not there and wanted is None:
         in_background(partial(_first_runs.compile, slam, room, sensor, first))
     try:
@@ -194,8 +194,8 @@ def chosen(
             warnings.warn(f"{one_line(error)}; {name} is computed by XLA", stacklevel=2)
         return "xla"
     if wanted is None:
-        records = finished(_first_runs(slam, room, sensor, first), f"{name}, by XLA")
-        wanted = jax.device_get(records)
+        wanted = finished(_first_runs(slam, room, sensor, first), f"{name}, by XLA")
+        wanted = jax.device_get(wanted)
         if place:  # a study that is run again needs no program of XLA's
             keep(place[0], lambda: (wanted,))
     lost = ~(wanted["nees"] <= lost_threshold(runs.poses.tangent_dim, wanted["nees"].shape[1]))

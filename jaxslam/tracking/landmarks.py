@@ -57,7 +57,8 @@ class Landmark:
         average over about `patience` of them."""
         success = self.success + (found - self.success) / patience
         if not found:
-            return replace(self, success=success, missed=self.missed + 1)
+            missed, unseen = self.missed + 1, self.unseen + 1
+            return replace(self, success=success, missed=missed, unseen=unseen)
         count = self.found + 1
         return replace(self, success=success, missed=0, unseen=0, seen_at=pixel, found=count)
 

@@ -379,11 +379,16 @@ def note_found(
 
     That nothing at all was found is the camera's failure, and held against no landmark.
     """
-    noted = {slot: replace(one, unseen=one.unseen + 1) for slot, one in landmarks.items()}
-    if seen.matched.any():
-        for slot, ok, pixel in zip(seen.slots.tolist(), seen.matched, seen.pixels, strict=True):
-            noted[slot] = noted[slot].searched(bool(ok), pixel, settings.patience)
-    return noted
+    rows = zip(seen.slots.tolist(), seen.matched.tolist(), seen.pixels, strict=True)
+    noted = {
+        slot: landmarks[slot].searched(ok, pixel, settings.patience)
+        for slot, ok, pixel in rows
+        if seen.matched.any()
+    }
+    return {
+        slot: noted.get(slot) or replace(one, unseen=one.unseen + 1)
+        for slot, one in landmarks.items()
+    }
 
 
 def failing(landmarks: Landmarks, settings: TrackerSettings) -> list[int]:
