@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from itertools import combinations, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -29,7 +29,8 @@ from jaxslam.evaluation.comparison import compared
 from jaxslam.evaluation.convention import Matrices, Squares
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
-from jaxslam.evaluation.sanity_checks import DEGREES, Mistake
+from jaxslam.evaluation.sanity_checks import Mistake
+from jaxslam.io.logs.log import DEGREE
 from jaxslam.io.tum import poses as poses_of
 from jaxslam.io.tum import quaternions
 
@@ -70,8 +71,8 @@ def causes(poses: Poses, found: Evaluation, used: tuple[str, ...] = ()) -> Itera
     if (few := poses.some()) is not poses:
         poses, found = few, compared(few)
     turns, told = any(name.startswith("r") for name in found.names), list[Mistake]()
-    looks = _misread, _tilt, _between, partial(_written, used)
-    for look in looks[not turns if wrong else 3 :]:
+    of_poses = (_misread, _tilt, _between) if turns else (_tilt, _between)
+    for look in (*(of_poses if wrong else ()), partial(_written, used)):
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
@@ -89,7 +90,8 @@ def explained(found: Evaluation) -> bool:
     """Whether nothing is left to be wrong by the verdict, which may allow for much, nor by what one
     right pose in 200 reaches, upwards or downwards."""
     share = float(scipy.special.chdtr(found.dof, _nees(found)))
-    return 0.005 < share < 0.995 and not suspect(found) and found.of_nees["word"] not in WORSE
+    right = 0.005 < share < 0.995 and found.of_nees["word"] not in WORSE
+    return right and not suspect(found)
 
 
 def _nees(found: Evaluation) -> float:
@@ -353,28 +355,38 @@ def _written(used: tuple[str, ...], poses: Poses, found: Evaluation) -> Mistake 
         scale = np.where(turn, by, 1.0)
         return scale[:, None] * P * scale
 
-    ways = {
-        "of half angles": (lambda: scaled(2.0), "angle=half in their header (g2o)"),
-        "of angles in degrees": (lambda: scaled(1 / DEGREES), "angle=deg in their header"),
-        "information matrices": (lambda: np.linalg.pinv(P, hermitian=True), "their inverses"),
-    }
+    half = "angle=half in their header (g2o)"
+    ways = [
+        Way("of half angles", lambda: scaled(2.0), half, doubtful=suspect(found)),
+        Way("of angles in degrees", lambda: scaled(DEGREE), "angle=deg in their header"),
+        Way("information matrices", lambda: np.linalg.pinv(P, hermitian=True), "their inverses"),
+    ]
     if not np.any(P * ~np.eye(len(turn), dtype=bool)):
-        ways |= {
-            "σ in place of variances": (lambda: P**2, "their squares"),
-            "of variances in place of σ": (lambda: np.sqrt(P), "their roots"),
-        }
-    poses = poses._replace(used=used)
-    ones = [_instead_of(poses, found, what, *way) for what, way in ways.items()]
+        ways += [
+            Way("σ in place of variances", lambda: P**2, "their squares"),
+            Way("of variances in place of σ", lambda: np.sqrt(P), "their roots"),
+        ]
+    ones = [_instead_of(poses._replace(used=used), found, way) for way in ways]
     return min(filter(None, ones), key=lambda x: not x.certain, default=None)
 
 
-def _instead_of(
-    poses: Poses, found: Evaluation, what: str, change: Callable[[], Squares], write: str
-) -> Mistake | None:
-    """The cause that covariances are `what`, where nothing is wrong once they are changed: in no
-    part, and beyond doubt if the σ of no axis stands out, and as they are it is wrong by far."""
+class Way(NamedTuple):
+    """Something else that the numbers of covariances may be."""
+
+    what: str
+    covariances: Callable[[], Squares]
+    write: str
+    """What to write instead."""
+    doubtful: bool = False
+    """Whether it is told as possible where the σ of an axis stands out."""
+
+
+def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
+    """The cause that covariances are something else, where nothing is wrong once they are changed:
+    in no part, and beyond doubt if the σ of no axis stands out, and as they are it is wrong by far.
+    """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), suppress(ValueError):
-        whole = poses._replace(covariances=change())
+        whole = poses._replace(covariances=way.covariances())
         fixed, off = compared(whole), np.abs(_factors(found))
         names = [[x for x in fixed.names if x.startswith("r") == of] for of in (False, True)]
         parts = [compared(whole._replace(used=tuple(x))) for x in names if x and explained(fixed)]
@@ -385,14 +397,14 @@ def _instead_of(
         left, width = [_factors(part) for part in parts], (1 + few) * np.log(HALF)
         near = all(abs(x.mean()) < width and np.ptp(x) < 3 * width for x in left)
         certain = bool(near and (not few or off.max() > ABSURD))
-        if not near and not (suspect(found) and "half" in what):
+        if not near and not way.doubtful:
             return None
         told = (
-            f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {write} "
+            f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {way.write} "
             f"{_instead(fixed, found)}. If they are what they are said to be, the filter is wrong"
         )
         are = "are" if certain else "may be"
-        return Mistake(f"the covariances {are} {what}", told, _nees(fixed), certain)
+        return Mistake(f"the covariances {are} {way.what}", told, _nees(fixed), certain)
     return None
 
 
