@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
-from itertools import combinations, product
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,20 +128,32 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
             return
 
 
+class Reading(NamedTuple):
+    """Another way to read poses."""
+
+    what: str
+    are: str
+    write: str
+    """What to write instead."""
+    change: Callable[[Matrices], Matrices]
+    of: tuple[str, ...] = ("estimate", "truth")
+    """Whose poses are changed: the truth's alone where either may be meant, as covariances are
+    along the axes of the estimate."""
+    flat: bool = True
+    """Whether poses in the plane may be meant too."""
+
+
 def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
-    """Quaternions with w first, or poses of the world in the body."""
+    """Poses that are to be read in another way (`READINGS`)."""
     n, there = poses.estimates.shape[-1] - 1, poses.logged
 
     def off(of: Poses) -> float:
-        return apart(*(x[there][:, :n, :n] for x in (of.estimates, of.truths)))
+        world = aligned(of._replace(used=())).poses
+        return apart(*(x[there][:, :n, :n] for x in (world.estimates, world.truths)))
 
     before, ones = off(poses), list[Mistake]()
-    ways = (
-        (_w_first, "quaternions", "have w first", "qx qy qz qw, or name the columns"),
-        (np.linalg.inv, "poses", "are inverse", "poses of the body in the world"),
-    )
-    for (change, what, are, write), name in product(ways[n < 3 :], ("estimate", "truth")):
-        read: dict[str, Any] = {f"{name}s": change(getattr(poses, f"{name}s"))}
+    for way, name in ((way, name) for way in READINGS if n == 3 or way.flat for name in way.of):
+        read: dict[str, Any] = {f"{name}s": way.change(getattr(poses, f"{name}s"))}
         changed = poses._replace(**read)
         after = off(changed)
         fixed = compared(changed) if after < before else found
@@ -149,10 +161,11 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
         far, near, less = before > TURNED, after < before / 4, _nees(found) / _nees(fixed)
         if (far and near and less > CLEARLY) or (less > 10 and explained(fixed)):
             certain = bool(far and (near or len(there) >= FEWEST))
+            are = way.are if certain else f"may {way.are}".replace("may are", "may be")
             one = Mistake(
-                f"{what} of the {name} {are if certain else f'may {are}'.replace('are', 'be')}",
+                f"{way.what} of the {name} {are}",
                 f"rotations differ by {np.degrees(before):.3g}° (median); without that "
-                f"{_instead(fixed, found)}; write {write}",
+                f"{_instead(fixed, found)}; write {way.write}",
                 _nees(fixed),
                 certain,
             )
@@ -167,11 +180,60 @@ def _w_first(T: Matrices) -> Matrices:
     return poses_of(flat[:, :3, 3], q).reshape(T.shape)
 
 
+def _along(world: np.ndarray, body: np.ndarray, T: Matrices) -> Matrices:
+    """Poses along other axes of the world and of the body; in the plane along their x and y."""
+    kept = [0, 1, 2, 3] if T.shape[-1] == 4 else [0, 1, 3]
+    return world[np.ix_(kept, kept)] @ T @ body[np.ix_(kept, kept)]
+
+
+def _turned(change: Callable[[Matrices], Matrices], T: Matrices) -> Matrices:
+    """Poses whose rotations alone are changed."""
+    result = change(T)
+    result[..., :-1, -1] = T[..., :-1, -1]
+    return result
+
+
+NED, FRD = np.diag([1.0, 1, -1, 1])[[1, 0, 2, 3]], np.diag([1.0, -1, -1, 1])
+"""North, east, down of east, north, up; forward, right, down of forward, left, up. Each undoes
+itself."""
+RIGHT = np.diag([1.0, -1, 1, 1])
+UNITY = np.diag([-1.0, 1, 1, 1]) @ np.eye(4)[[1, 2, 0, 3]]
+"""Forward, right, up (CARLA), and right, up, forward, of forward, left, up: left-handed."""
+mirrored, _navigation = partial(_along, RIGHT, RIGHT), partial(_along, NED, FRD)
+_NED = "are north, east, down and the estimate's east, north, up, or conversely"
+_LEFT = (
+    "axes", "are left-handed and the estimate's right-handed, or conversely (Unity, CARLA)",
+    "both right-handed, as y and the turns about x and z with the other sign",
+)  # fmt: skip
+READINGS = (
+    Reading("quaternions", "have w first", "qx qy qz qw, or name the columns", _w_first,
+            flat=False),
+    Reading("quaternions", "are conjugated (JPL)", "the rotation of the body in the world",
+            partial(_turned, np.linalg.inv), flat=False),
+    Reading("poses", "are inverse", "poses of the body in the world", np.linalg.inv),
+    Reading("axes", _NED, "both along the same axes", _navigation, ("truth",)),
+    Reading("axes", _NED, "both along the same axes", partial(_along, NED, np.eye(4)), ("truth",),
+            flat=False),
+    Reading("headings", "are clockwise from north and the estimate's anticlockwise from east, or "
+            "conversely", "both alike, as 90° − heading", partial(_turned, _navigation),
+            ("truth",)),
+    Reading(*_LEFT, mirrored, ("truth",)),
+    *(Reading(*_LEFT, partial(_along, axes, axes.T), ("truth",), flat=False)
+      for axes in (UNITY, UNITY.T)),
+)  # fmt: skip
+
+
 def _between(poses: Poses, found: Evaluation) -> Mistake | None:
     """Two bodies or two worlds, whichever explains more; a world has fewer numbers."""
-    body = _mounting(poses, found)
+    body, world = _mounting(poses, found), None
     with suppress(ValueError):  # positions coincide
-        world = _worlds(poses, found) if poses.align == "none" else None
+        if poses.align == "none":
+            world = _worlds(poses, found)
+            other = _worlds(poses._replace(truths=mirrored(poses.truths)), found)
+            most = min(UNEXPLAINED**2 * found.dof, world.nees or 0.0 if world else np.inf)
+            if other and LESS * (other.nees or 0.0) < min(_nees(found), most):
+                told = f"{other.told}, of a truth that is mirrored: one of both is left-handed"
+                world = other._replace(told=told)
         most = CLEARLY * max(world.nees or 0.0, found.dof) if world else np.inf
         if world and not (body and (body.nees or 0.0) < most):
             return world
@@ -330,7 +392,7 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
 
 
 def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
-    """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
+    """Whether X is more than the scatter of what every run alone would add to it."""
     n, moved = len(X) - 1, aligned(unmounted._replace(used=())).poses
     if len(moved.logged) < FEWEST:
         return False
@@ -343,7 +405,12 @@ def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
     each = np.array(
         [parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs]
     )
-    t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
+    return _beyond_scatter(parts(X[None])[0], each)
+
+
+def _beyond_scatter(values: np.ndarray, each: Float[np.ndarray, "runs k"]) -> bool:
+    """Whether any value is more than what runs scatter by, by a t-test."""
+    t = np.abs(values) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
     return bool(2 * scipy.special.stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
@@ -396,7 +463,7 @@ def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
         few = len(poses.logged) < FEWEST
         left, width = [_factors(part) for part in parts], (1 + few) * np.log(HALF)
         near = all(abs(x.mean()) < width and np.ptp(x) < 3 * width for x in left)
-        certain = bool(near and (not few or off.max() > ABSURD))
+        certain = bool(near and (off.max() > ABSURD or not (few or _alike(found))))
         if not near and not way.doubtful:
             return None
         told = (
@@ -406,6 +473,17 @@ def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
         are = "are" if certain else "may be"
         return Mistake(f"the covariances {are} {way.what}", told, _nees(fixed), certain)
     return None
+
+
+def _alike(found: Evaluation) -> bool:
+    """Whether σ of positions and of rotations may be wrong by one factor, as runs scatter."""
+    turns = np.array([name.startswith("r") for name in found.names])
+    if turns.all() or not turns.any():
+        return False
+    z = np.clip(found.errors / found.sigmas, -1e150, 1e150) ** 2
+    off = [np.log(np.nanmean(z[..., part], axis=(1, 2)) + 1e-300) for part in (turns, ~turns)]
+    each = np.subtract(*off)[:, None]
+    return not _beyond_scatter(each.mean(axis=0), each)
 
 
 def _factors(found: Evaluation) -> Float[np.ndarray, " n"]:

@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, symmetric
+from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, of_two_cells, symmetric
 from jaxslam.io.logs.unnamed import is_deviations
 from jaxslam.io.text import Table, read_table, without_values
 from jaxslam.io.tum import table_text
@@ -137,7 +137,7 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
 def pose_errors(convention: Convention, estimates: Matrices, truths: Matrices) -> Tangents:
     """The error of every pose in the convention."""
     result = _in_float64(_error, convention.error, estimates, truths)
-    T, e = (x.reshape(-1, *x.shape[2:]) for x in (estimates, result))
+    T, e = estimates.reshape(-1, *estimates.shape[-2:]), result.reshape(-1, result.shape[-1])
     for part in blocks(len(T)):
         e[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), e[part])
     return result
@@ -322,6 +322,9 @@ def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False
     table = read_table(path, "covariances", "covariances", "a time and finite numbers")
     rows, count = table.rows, table.rows.shape[1]
     told, of_titles, assumed = named.covariances(table, flat=t == 3)
+    one = None if told is not None or count < 3 else of_two_cells(rows)
+    if one is not None:
+        rows, count = one, count - 1
     alone = positions and told is None and count in (4, 7, 10)
     t = 3 if alone else t
     triangle = 1 + t * (t + 1) // 2
