@@ -76,9 +76,21 @@ def causes(poses: Poses, found: Evaluation, used: tuple[str, ...] = ()) -> Itera
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
-        if told and told[-1].certain:
+        if any(x.certain and (x.nees or 0.0) < UNEXPLAINED**2 * found.dof for x in told):
             break
-    yield from [x for x in told if x.certain] or told
+    # What is possible and explains as much leaves nothing certain.
+    least = min((x.nees or 0.0 for x in told if not x.certain), default=np.inf)
+    told = [x._replace(certain=x.certain and (x.nees or 0.0) * CLEARLY < least) for x in told]
+    best = [x for x in told if x.certain][:1]
+    for x in told:  # what explains far more than the first one that is certain
+        best = [x] if best and x.certain and LESS * (x.nees or 0.0) < (best[0].nees or 0.0) else best
+    yield from best or map(_possible, told)
+
+
+def _possible(cause: Mistake) -> Mistake:
+    """The same, in words that do not say that it is there."""
+    what = cause.what.replace(" are ", " may be ", 1).replace(" have ", " may have ", 1)
+    return cause._replace(what=what)
 
 
 def suspect(found: Evaluation) -> bool:
@@ -161,9 +173,8 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
         far, near, less = before > TURNED, after < before / 4, _nees(found) / _nees(fixed)
         if (far and near and less > CLEARLY) or (less > 10 and explained(fixed)):
             certain = bool(far and (near or len(there) >= FEWEST))
-            are = way.are if certain else f"may {way.are}".replace("may are", "may be")
             one = Mistake(
-                f"{way.what} of the {name} {are}",
+                f"{way.what} of the {name} {way.are}",
                 f"rotations differ by {np.degrees(before):.3g}° (median); without that "
                 f"{_instead(fixed, found)}; write {way.write}",
                 _nees(fixed),
@@ -324,7 +335,7 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     ]
     by_part = f" ({', '.join(alone)})" if len(alone) > 1 else ""
     return Mistake(
-        f"estimate and truth {'are' if certain else 'may be'} of two bodies",
+        "estimate and truth are of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
         f"{_instead(best, found)}{by_part}; give the truth of the body that is estimated",
         _nees(best),
@@ -470,8 +481,7 @@ def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
             f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {way.write} "
             f"{_instead(fixed, found)}. If they are what they are said to be, the filter is wrong"
         )
-        are = "are" if certain else "may be"
-        return Mistake(f"the covariances {are} {way.what}", told, _nees(fixed), certain)
+        return Mistake(f"the covariances are {way.what}", told, _nees(fixed), certain)
     return None
 
 

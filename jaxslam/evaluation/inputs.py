@@ -51,7 +51,7 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             raise ValueError
-        array = array.astype(np.float64)
+        array = array.astype(np.float64, copy=ndim < 4)  # matrices are large, and no result
     except (ValueError, TypeError):
         raise ValueError(f"{what} must be numbers, an array {shape}") from None
     if array.ndim != ndim or not array.size:
