@@ -356,9 +356,11 @@ def titled(titles, *columns, between=","):
 def dated(i, row):
     """A line whose time is a date."""
     date = datetime.fromtimestamp(float(row[0]), UTC)
-    form = ("%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y%m%dT%H%M%S.%f",
-            "%Y/%m/%d_%H-%M-%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%d-%b-%Y %H:%M:%S.%f")[i % 6]  # fmt: skip
-    return " ".join([date.strftime(form), *row[1:]])
+    forms = (
+        "%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y%m%dT%H%M%S.%f",
+        "%Y/%m/%d_%H-%M-%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%d-%b-%Y %H:%M:%S.%f",
+    )  # fmt: skip
+    return " ".join([date.strftime(forms[i % len(forms)]), *row[1:]])
 
 
 def in_weeks(_, row):
@@ -485,7 +487,7 @@ def echoed(folder):
 
 
 def nclt(folder, degrees=False, angles_first=False):
-    """Microseconds, positions, and roll, pitch and yaw; of FAST-LIO these come first."""
+    """Microseconds, positions, and roll, pitch and yaw; FAST-LIO has these first."""
     tum(folder)
     for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
         (folder / f"{name}.txt").unlink()

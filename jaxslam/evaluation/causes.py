@@ -76,21 +76,25 @@ def causes(poses: Poses, found: Evaluation, used: tuple[str, ...] = ()) -> Itera
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
-        if any(x.certain and (x.nees or 0.0) < UNEXPLAINED**2 * found.dof for x in told):
+        if any(x.certain and _left(x) < UNEXPLAINED**2 * found.dof for x in told):
             break
     # What is possible and explains as much leaves nothing certain.
-    least = min((x.nees or 0.0 for x in told if not x.certain), default=np.inf)
-    told = [x._replace(certain=x.certain and (x.nees or 0.0) * CLEARLY < least) for x in told]
-    best = [x for x in told if x.certain][:1]
-    for x in told:  # what explains far more than the first one that is certain
-        best = [x] if best and x.certain and LESS * (x.nees or 0.0) < (best[0].nees or 0.0) else best
-    yield from best or map(_possible, told)
+    least = min((_left(x) for x in told if not x.certain), default=np.inf)
+    certain = [x for x in told if x.certain and CLEARLY * _left(x) < least]
+    # What explains far more than the first comes before it.
+    better = [x for x in certain if LESS * _left(x) < _left(certain[0])]
+    yield from better[-1:] or certain[:1] or map(_possible, told)
+
+
+def _left(cause: Mistake) -> float:
+    """The NEES that a cause leaves, as computed for each of them."""
+    return cause.nees or 0.0
 
 
 def _possible(cause: Mistake) -> Mistake:
     """The same, in words that do not say that it is there."""
     what = cause.what.replace(" are ", " may be ", 1).replace(" have ", " may have ", 1)
-    return cause._replace(what=what)
+    return cause._replace(what=what, certain=False)
 
 
 def suspect(found: Evaluation) -> bool:
@@ -164,7 +168,7 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
         return apart(*(x[there][:, :n, :n] for x in (world.estimates, world.truths)))
 
     before, ones = off(poses), list[Mistake]()
-    for way, name in ((way, name) for way in READINGS if n == 3 or way.flat for name in way.of):
+    for way, name in [(x, name) for x in READINGS if n == 3 or x.flat for name in x.of]:
         read: dict[str, Any] = {f"{name}s": way.change(getattr(poses, f"{name}s"))}
         changed = poses._replace(**read)
         after = off(changed)
@@ -181,7 +185,7 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
                 certain,
             )
             ones.append(one)
-    return min(ones, key=lambda x: x.nees or 0.0, default=None)
+    return min(ones, key=_left, default=None)
 
 
 def _w_first(T: Matrices) -> Matrices:
@@ -241,12 +245,12 @@ def _between(poses: Poses, found: Evaluation) -> Mistake | None:
         if poses.align == "none":
             world = _worlds(poses, found)
             other = _worlds(poses._replace(truths=mirrored(poses.truths)), found)
-            most = min(UNEXPLAINED**2 * found.dof, world.nees or 0.0 if world else np.inf)
-            if other and LESS * (other.nees or 0.0) < min(_nees(found), most):
+            most = min(UNEXPLAINED**2 * found.dof, _left(world) if world else np.inf)
+            if other and LESS * _left(other) < min(_nees(found), most):
                 told = f"{other.told}, of a truth that is mirrored: one of both is left-handed"
                 world = other._replace(told=told)
-        most = CLEARLY * max(world.nees or 0.0, found.dof) if world else np.inf
-        if world and not (body and (body.nees or 0.0) < most):
+        most = CLEARLY * max(_left(world), found.dof) if world else np.inf
+        if world and not (body and _left(body) < most):
             return world
     return body
 
@@ -474,7 +478,8 @@ def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
         few = len(poses.logged) < FEWEST
         left, width = [_factors(part) for part in parts], (1 + few) * np.log(HALF)
         near = all(abs(x.mean()) < width and np.ptp(x) < 3 * width for x in left)
-        certain = bool(near and (off.max() > ABSURD or not (few or _alike(found))))
+        doubtful = few or found.most is not None or _alike(found)
+        certain = bool(near and (off.max() > ABSURD or not doubtful))
         if not near and not way.doubtful:
             return None
         told = (

@@ -136,7 +136,7 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
 
 def pose_errors(convention: Convention, estimates: Matrices, truths: Matrices) -> Tangents:
     """The error of every pose in the convention."""
-    result = _in_float64(_error, convention.error, estimates, truths)
+    result = np.asarray(_in_float64(_error, convention.error, estimates, truths))
     T, e = estimates.reshape(-1, *estimates.shape[-2:]), result.reshape(-1, result.shape[-1])
     for part in blocks(len(T)):
         e[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), e[part])

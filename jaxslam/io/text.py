@@ -30,7 +30,7 @@ _DATES = tuple(
     )
 )
 """Dates and times, which are a cell, in whatever columns: the year first, or the day."""
-_MONTHS = "Jan Feb Mar Apr May Jun Jul Aug Sep Oct Nov Dec".split()
+_MONTHS = "JanFebMarAprMayJunJulAugSepOctNovDec"
 _ISO = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:")
 _OTHER_DATE = re.compile(r"(?<![\d:])(\d\d?/\d\d?/\d{4}|\d\d?:\d\d:\d\d)")
 _TITLED = "write a table with titles instead, as t,x,y,z,qx,qy,qz,qw, a pose per line"
@@ -138,8 +138,10 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
         raise ValueError(f"{path} has no {holds}; expected lines of {row}")
     first = lines[min(lines)]
     if other := _OTHER_DATE.search(_ISO.sub("", first)):
-        told = "write seconds, or dates with times as 2026-11-30T12:00:00"
-        raise ValueError(f"{path}, line {min(lines)}: {other[0]} may mean several times; {told}")
+        raise ValueError(
+            f"{path}, line {min(lines)}: {other[0]} may mean several times; write seconds, or "
+            "dates with times as 2026-11-30T12:00:00"
+        )
     separator = _separator(first)
     count = len(cells(first, separator))
     titles = _titles([*reversed(named), *reversed(comments)], count, separator)
@@ -244,7 +246,7 @@ def with_iso(line: str) -> str:
 
     def iso(found: re.Match[str]) -> str:
         year, month, *others = found.group("year", "month", "day", "h", "m", "s")
-        month = f"{_MONTHS.index(month) + 1:02}" if month in _MONTHS else month
+        month = f"{_MONTHS.find(month) // 3 + 1:02}" if month.isalpha() else month
         return "{}-{}-{}T{}:{}:{}".format(year, month, *others)
 
     for date in _DATES:

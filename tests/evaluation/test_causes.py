@@ -62,8 +62,10 @@ def of_other_axes(world, body, turns_alone=False):
     """A truth along other axes of the world and of the body, or its rotations alone."""
 
     def put(_, log):
-        T = np.array(world) @ log.dense[..., :3, :] @ np.block(
-            [[np.array(body), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]
+        T = (
+            np.array(world)
+            @ log.dense[..., :3, :]
+            @ np.block([[np.array(body), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
         )
         dense = log.dense.copy()
         dense[..., :3, : 3 if turns_alone else 4] = T[..., : 3 if turns_alone else 4]

@@ -173,8 +173,10 @@ def _positions(table: Table) -> Log:
 
 
 FORMATS: tuple[tuple[str, Reader], ...] = (
-    ("sec nsec (or a week of GPS and its seconds) x y z qx qy qz qw and maybe ROS' covariance",
-     _as_titled),
+    (
+        "sec nsec (or a week of GPS and its seconds) x y z qx qy qz qw and maybe ROS' covariance",
+        _as_titled,
+    ),
     ("t x y z roll pitch yaw, or the angles first", _of_angles),
     ("KITTI, 12 numbers, or 13 and 17 with a time", _kitti),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
