@@ -698,7 +698,7 @@ LOGS = {
         trajectories("t x y z qw qx qy qz" + 9 * " v", between=" "), spare=True),
     "TUM, dates": Log(rewritten(dated)),
     "TUM, weeks of GPS": Log(rewritten(in_weeks)),
-    "TUM, days": Log(rewritten(in_days)),
+    "datenum of MATLAB": Log(rewritten(in_days)),
     "TUM, nanoseconds of ORB-SLAM3": Log(
         trajectories("t x y z qx qy qz qw", between=" ", nanoseconds=True, ending="txt")),
     "TUM, variances by titles": Log(tum_and(

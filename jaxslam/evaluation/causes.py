@@ -460,7 +460,7 @@ class Way(NamedTuple):
     write: str
     """What to write instead."""
     doubtful: bool = False
-    """Whether it is told as possible where the σ of an axis stands out."""
+    """Whether it is possible even where the σ of an axis stands out."""
 
 
 def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
