@@ -356,7 +356,22 @@ def titled(titles, *columns, between=","):
 def dated(i, row):
     """A line whose time is a date."""
     date = datetime.fromtimestamp(float(row[0]), UTC)
-    return " ".join([date.isoformat(" " if i % 2 else "T", "microseconds"), *row[1:]])
+    forms = (
+        "%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y%m%dT%H%M%S.%f",
+        "%Y/%m/%d_%H-%M-%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%d-%b-%Y %H:%M:%S.%f",
+    )  # fmt: skip
+    return " ".join([date.strftime(forms[i % len(forms)]), *row[1:]])
+
+
+def in_weeks(_, row):
+    """A line whose time is a week of GPS and its seconds."""
+    week, seconds = divmod(float(row[0]) - 315964800, 604800)
+    return " ".join([f"{week:.0f} {seconds:.6f}", *row[1:]])
+
+
+def in_days(_, row):
+    """A line whose time is a datenum of MATLAB."""
+    return " ".join([f"{float(row[0]) / 86400 + 719529:.12f}", *row[1:]])
 
 
 def of_cnspy(kind, blocks):
@@ -471,13 +486,14 @@ def echoed(folder):
     (folder / "estimate.csv").write_text("\n".join(rows) + "\n")
 
 
-def nclt(folder, degrees=False):
-    """Microseconds, positions, and roll, pitch and yaw."""
+def nclt(folder, degrees=False, angles_first=False):
+    """Microseconds, positions, and roll, pitch and yaw; FAST-LIO has these first."""
     tum(folder)
     for name, T in (("estimate", ESTIMATE), ("truth", TRUTH)):
         (folder / f"{name}.txt").unlink()
         angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=degrees)
-        lines(folder / f"{name}.csv", np.round(1e6 * TIMES), T[:, :3, 3], angles, between=",")
+        parts = (T[:, :3, 3], angles)[:: -1 if angles_first else 1]
+        lines(folder / f"{name}.csv", np.round(1e6 * TIMES), *parts, between=",")
 
 
 def in_degrees(*names, graph=False):
@@ -681,6 +697,8 @@ LOGS = {
     "w first, 17 numbers": Log(
         trajectories("t x y z qw qx qy qz" + 9 * " v", between=" "), spare=True),
     "TUM, dates": Log(rewritten(dated)),
+    "TUM, weeks of GPS": Log(rewritten(in_weeks)),
+    "datenum of MATLAB": Log(rewritten(in_days)),
     "TUM, nanoseconds of ORB-SLAM3": Log(
         trajectories("t x y z qx qy qz qw", between=" ", nanoseconds=True, ending="txt")),
     "TUM, variances by titles": Log(tum_and(
@@ -743,6 +761,14 @@ LOGS = {
     "g2o": Log(graph),
     "NCLT": Log(nclt),
     "NCLT in degrees": Log(partial(nclt, degrees=True)),
+    "FAST-LIO": Log(partial(nclt, angles_first=True)),
+    "titles of deviations": Log(titled(
+        "t x y z qx qy qz qw x_sig sigY z_sd unc_rx ry_std dev_rz", TIMES, ESTIMATE[:, :3, 3],
+        quaternions(R), SIGMA,
+    ), OF_SIGMAS),
+    "titles of an information matrix": Log(titled(
+        "t x y z qx qy qz qw inf_{}", TIMES, ESTIMATE[:, :3, 3], quaternions(R), np.linalg.inv(P)
+    )),
     **{
         f"plane, degrees in {' and '.join(names)}": Log(in_degrees(*names), IN_THE_PLANE)
         for names in (("estimate",), ("truth",), ("estimate", "truth"))

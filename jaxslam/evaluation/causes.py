@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
-from itertools import combinations, product
-from typing import Any
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
@@ -29,7 +29,8 @@ from jaxslam.evaluation.comparison import compared
 from jaxslam.evaluation.convention import Matrices, Squares
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.evaluation.result import Evaluation
-from jaxslam.evaluation.sanity_checks import DEGREES, Mistake
+from jaxslam.evaluation.sanity_checks import Mistake
+from jaxslam.io.logs.log import DEGREE
 from jaxslam.io.tum import poses as poses_of
 from jaxslam.io.tum import quaternions
 
@@ -70,14 +71,30 @@ def causes(poses: Poses, found: Evaluation, used: tuple[str, ...] = ()) -> Itera
     if (few := poses.some()) is not poses:
         poses, found = few, compared(few)
     turns, told = any(name.startswith("r") for name in found.names), list[Mistake]()
-    looks = _misread, _tilt, _between, partial(_written, used)
-    for look in looks[not turns if wrong else 3 :]:
+    of_poses = (_misread, _tilt, _between) if turns else (_tilt, _between)
+    for look in (*(of_poses if wrong else ()), partial(_written, used)):
         # A first pose that is known exactly would not be; or positions coincide.
         with suppress(ValueError):
             told += filter(None, [look(poses, found)])
-        if told and told[-1].certain:
+        if any(x.certain and _left(x) < UNEXPLAINED**2 * found.dof for x in told):
             break
-    yield from [x for x in told if x.certain] or told
+    # What is possible and explains as much leaves nothing certain.
+    least = min((_left(x) for x in told if not x.certain), default=np.inf)
+    certain = [x for x in told if x.certain and CLEARLY * _left(x) < least]
+    # What explains far more than the first comes before it.
+    better = [x for x in certain if LESS * _left(x) < _left(certain[0])]
+    yield from better[-1:] or certain[:1] or map(_possible, told)
+
+
+def _left(cause: Mistake) -> float:
+    """The NEES that a cause leaves, as computed for each of them."""
+    return cause.nees or 0.0
+
+
+def _possible(cause: Mistake) -> Mistake:
+    """The same, in words that do not say that it is there."""
+    what = cause.what.replace(" are ", " may be ", 1).replace(" have ", " may have ", 1)
+    return cause._replace(what=what, certain=False)
 
 
 def suspect(found: Evaluation) -> bool:
@@ -89,7 +106,8 @@ def explained(found: Evaluation) -> bool:
     """Whether nothing is left to be wrong by the verdict, which may allow for much, nor by what one
     right pose in 200 reaches, upwards or downwards."""
     share = float(scipy.special.chdtr(found.dof, _nees(found)))
-    return 0.005 < share < 0.995 and not suspect(found) and found.of_nees["word"] not in WORSE
+    right = 0.005 < share < 0.995 and found.of_nees["word"] not in WORSE
+    return right and not suspect(found)
 
 
 def _nees(found: Evaluation) -> float:
@@ -126,20 +144,32 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
             return
 
 
+class Reading(NamedTuple):
+    """Another way to read poses."""
+
+    what: str
+    are: str
+    write: str
+    """What to write instead."""
+    change: Callable[[Matrices], Matrices]
+    of: tuple[str, ...] = ("estimate", "truth")
+    """Whose poses are changed: the truth's alone where either may be meant, as covariances are
+    along the axes of the estimate."""
+    flat: bool = True
+    """Whether poses in the plane may be meant too."""
+
+
 def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
-    """Quaternions with w first, or poses of the world in the body."""
+    """Poses that are to be read in another way (`READINGS`)."""
     n, there = poses.estimates.shape[-1] - 1, poses.logged
 
     def off(of: Poses) -> float:
-        return apart(*(x[there][:, :n, :n] for x in (of.estimates, of.truths)))
+        world = aligned(of._replace(used=())).poses
+        return apart(*(x[there][:, :n, :n] for x in (world.estimates, world.truths)))
 
     before, ones = off(poses), list[Mistake]()
-    ways = (
-        (_w_first, "quaternions", "have w first", "qx qy qz qw, or name the columns"),
-        (np.linalg.inv, "poses", "are inverse", "poses of the body in the world"),
-    )
-    for (change, what, are, write), name in product(ways[n < 3 :], ("estimate", "truth")):
-        read: dict[str, Any] = {f"{name}s": change(getattr(poses, f"{name}s"))}
+    for way, name in [(x, name) for x in READINGS if n == 3 or x.flat for name in x.of]:
+        read: dict[str, Any] = {f"{name}s": way.change(getattr(poses, f"{name}s"))}
         changed = poses._replace(**read)
         after = off(changed)
         fixed = compared(changed) if after < before else found
@@ -148,14 +178,14 @@ def _misread(poses: Poses, found: Evaluation) -> Mistake | None:
         if (far and near and less > CLEARLY) or (less > 10 and explained(fixed)):
             certain = bool(far and (near or len(there) >= FEWEST))
             one = Mistake(
-                f"{what} of the {name} {are if certain else f'may {are}'.replace('are', 'be')}",
+                f"{way.what} of the {name} {way.are}",
                 f"rotations differ by {np.degrees(before):.3g}° (median); without that "
-                f"{_instead(fixed, found)}; write {write}",
+                f"{_instead(fixed, found)}; write {way.write}",
                 _nees(fixed),
                 certain,
             )
             ones.append(one)
-    return min(ones, key=lambda x: x.nees or 0.0, default=None)
+    return min(ones, key=_left, default=None)
 
 
 def _w_first(T: Matrices) -> Matrices:
@@ -165,13 +195,62 @@ def _w_first(T: Matrices) -> Matrices:
     return poses_of(flat[:, :3, 3], q).reshape(T.shape)
 
 
+def _along(world: np.ndarray, body: np.ndarray, T: Matrices) -> Matrices:
+    """Poses along other axes of the world and of the body; in the plane along their x and y."""
+    kept = [0, 1, 2, 3] if T.shape[-1] == 4 else [0, 1, 3]
+    return world[np.ix_(kept, kept)] @ T @ body[np.ix_(kept, kept)]
+
+
+def _turned(change: Callable[[Matrices], Matrices], T: Matrices) -> Matrices:
+    """Poses whose rotations alone are changed."""
+    result = change(T)
+    result[..., :-1, -1] = T[..., :-1, -1]
+    return result
+
+
+NED, FRD = np.diag([1.0, 1, -1, 1])[[1, 0, 2, 3]], np.diag([1.0, -1, -1, 1])
+"""North, east, down of east, north, up; forward, right, down of forward, left, up. Each undoes
+itself."""
+RIGHT = np.diag([1.0, -1, 1, 1])
+UNITY = np.diag([-1.0, 1, 1, 1]) @ np.eye(4)[[1, 2, 0, 3]]
+"""Forward, right, up (CARLA), and right, up, forward, of forward, left, up: left-handed."""
+mirrored, _navigation = partial(_along, RIGHT, RIGHT), partial(_along, NED, FRD)
+_NED = "are north, east, down and the estimate's east, north, up, or conversely"
+_LEFT = (
+    "axes", "are left-handed and the estimate's right-handed, or conversely (Unity, CARLA)",
+    "both right-handed, as y and the turns about x and z with the other sign",
+)  # fmt: skip
+READINGS = (
+    Reading("quaternions", "have w first", "qx qy qz qw, or name the columns", _w_first,
+            flat=False),
+    Reading("quaternions", "are conjugated (JPL)", "the rotation of the body in the world",
+            partial(_turned, np.linalg.inv), flat=False),
+    Reading("poses", "are inverse", "poses of the body in the world", np.linalg.inv),
+    Reading("axes", _NED, "both along the same axes", _navigation, ("truth",)),
+    Reading("axes", _NED, "both along the same axes", partial(_along, NED, np.eye(4)), ("truth",),
+            flat=False),
+    Reading("headings", "are clockwise from north and the estimate's anticlockwise from east, or "
+            "conversely", "both alike, as 90° − heading", partial(_turned, _navigation),
+            ("truth",)),
+    Reading(*_LEFT, mirrored, ("truth",)),
+    *(Reading(*_LEFT, partial(_along, axes, axes.T), ("truth",), flat=False)
+      for axes in (UNITY, UNITY.T)),
+)  # fmt: skip
+
+
 def _between(poses: Poses, found: Evaluation) -> Mistake | None:
     """Two bodies or two worlds, whichever explains more; a world has fewer numbers."""
-    body = _mounting(poses, found)
+    body, world = _mounting(poses, found), None
     with suppress(ValueError):  # positions coincide
-        world = _worlds(poses, found) if poses.align == "none" else None
-        most = CLEARLY * max(world.nees or 0.0, found.dof) if world else np.inf
-        if world and not (body and (body.nees or 0.0) < most):
+        if poses.align == "none":
+            world = _worlds(poses, found)
+            other = _worlds(poses._replace(truths=mirrored(poses.truths)), found)
+            most = min(UNEXPLAINED**2 * found.dof, _left(world) if world else np.inf)
+            if other and LESS * _left(other) < min(_nees(found), most):
+                told = f"{other.told}, of a truth that is mirrored: one of both is left-handed"
+                world = other._replace(told=told)
+        most = CLEARLY * max(_left(world), found.dof) if world else np.inf
+        if world and not (body and _left(body) < most):
             return world
     return body
 
@@ -260,7 +339,7 @@ def _mounting(poses: Poses, found: Evaluation) -> Mistake | None:
     ]
     by_part = f" ({', '.join(alone)})" if len(alone) > 1 else ""
     return Mistake(
-        f"estimate and truth {'are' if certain else 'may be'} of two bodies",
+        "estimate and truth are of two bodies",
         f"{' and '.join(parts)} between them, the same at every pose: without it "
         f"{_instead(best, found)}{by_part}; give the truth of the body that is estimated",
         _nees(best),
@@ -328,7 +407,7 @@ def _of_body(poses: Poses, found: Evaluation, fixed: Evaluation, angle: float) -
 
 
 def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
-    """Whether X is more than the scatter of what every run alone would add to it, by a t-test."""
+    """Whether X is more than the scatter of what every run alone would add to it."""
     n, moved = len(X) - 1, aligned(unmounted._replace(used=())).poses
     if len(moved.logged) < FEWEST:
         return False
@@ -341,7 +420,12 @@ def _in_all_runs(X: Transform, unmounted: Poses) -> bool:
     each = np.array(
         [parts(np.linalg.inv(T[own]) @ true[own]).mean(axis=0) for T, true, own in runs]
     )
-    t = np.abs(parts(X[None])[0]) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
+    return _beyond_scatter(parts(X[None])[0], each)
+
+
+def _beyond_scatter(values: np.ndarray, each: Float[np.ndarray, "runs k"]) -> bool:
+    """Whether any value is more than what runs scatter by, by a t-test."""
+    t = np.abs(values) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
     return bool(2 * scipy.special.stdtr(len(each) - 1, -t).min() * len(t) < ALPHA)
 
 
@@ -353,28 +437,38 @@ def _written(used: tuple[str, ...], poses: Poses, found: Evaluation) -> Mistake 
         scale = np.where(turn, by, 1.0)
         return scale[:, None] * P * scale
 
-    ways = {
-        "of half angles": (lambda: scaled(2.0), "angle=half in their header (g2o)"),
-        "of angles in degrees": (lambda: scaled(1 / DEGREES), "angle=deg in their header"),
-        "information matrices": (lambda: np.linalg.pinv(P, hermitian=True), "their inverses"),
-    }
+    half = "angle=half in their header (g2o)"
+    ways = [
+        Way("of half angles", lambda: scaled(2.0), half, doubtful=suspect(found)),
+        Way("of angles in degrees", lambda: scaled(DEGREE), "angle=deg in their header"),
+        Way("information matrices", lambda: np.linalg.pinv(P, hermitian=True), "their inverses"),
+    ]
     if not np.any(P * ~np.eye(len(turn), dtype=bool)):
-        ways |= {
-            "σ in place of variances": (lambda: P**2, "their squares"),
-            "of variances in place of σ": (lambda: np.sqrt(P), "their roots"),
-        }
-    poses = poses._replace(used=used)
-    ones = [_instead_of(poses, found, what, *way) for what, way in ways.items()]
+        ways += [
+            Way("σ in place of variances", lambda: P**2, "their squares"),
+            Way("of variances in place of σ", lambda: np.sqrt(P), "their roots"),
+        ]
+    ones = [_instead_of(poses._replace(used=used), found, way) for way in ways]
     return min(filter(None, ones), key=lambda x: not x.certain, default=None)
 
 
-def _instead_of(
-    poses: Poses, found: Evaluation, what: str, change: Callable[[], Squares], write: str
-) -> Mistake | None:
-    """The cause that covariances are `what`, where nothing is wrong once they are changed: in no
-    part, and beyond doubt if the σ of no axis stands out, and as they are it is wrong by far."""
+class Way(NamedTuple):
+    """Something else that the numbers of covariances may be."""
+
+    what: str
+    covariances: Callable[[], Squares]
+    write: str
+    """What to write instead."""
+    doubtful: bool = False
+    """Whether it is possible even where the σ of an axis stands out."""
+
+
+def _instead_of(poses: Poses, found: Evaluation, way: Way) -> Mistake | None:
+    """The cause that covariances are something else, where nothing is wrong once they are changed:
+    in no part, and beyond doubt if the σ of no axis stands out, and as they are it is wrong by far.
+    """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), suppress(ValueError):
-        whole = poses._replace(covariances=change())
+        whole = poses._replace(covariances=way.covariances())
         fixed, off = compared(whole), np.abs(_factors(found))
         names = [[x for x in fixed.names if x.startswith("r") == of] for of in (False, True)]
         parts = [compared(whole._replace(used=tuple(x))) for x in names if x and explained(fixed)]
@@ -384,16 +478,27 @@ def _instead_of(
         few = len(poses.logged) < FEWEST
         left, width = [_factors(part) for part in parts], (1 + few) * np.log(HALF)
         near = all(abs(x.mean()) < width and np.ptp(x) < 3 * width for x in left)
-        certain = bool(near and (not few or off.max() > ABSURD))
-        if not near and not (suspect(found) and "half" in what):
+        doubtful = few or found.most is not None or _alike(found)
+        certain = bool(near and (off.max() > ABSURD or not doubtful))
+        if not near and not way.doubtful:
             return None
         told = (
-            f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {write} "
+            f"σ is wrong by up to {np.exp(off.max()):.3g} as they are: with {way.write} "
             f"{_instead(fixed, found)}. If they are what they are said to be, the filter is wrong"
         )
-        are = "are" if certain else "may be"
-        return Mistake(f"the covariances {are} {what}", told, _nees(fixed), certain)
+        return Mistake(f"the covariances are {way.what}", told, _nees(fixed), certain)
     return None
+
+
+def _alike(found: Evaluation) -> bool:
+    """Whether σ of positions and of rotations may be wrong by one factor, as runs scatter."""
+    turns = np.array([name.startswith("r") for name in found.names])
+    if turns.all() or not turns.any():
+        return False
+    z = np.clip(found.errors / found.sigmas, -1e150, 1e150) ** 2
+    off = [np.log(np.nanmean(z[..., part], axis=(1, 2)) + 1e-300) for part in (turns, ~turns)]
+    each = np.subtract(*off)[:, None]
+    return not _beyond_scatter(each.mean(axis=0), each)
 
 
 def _factors(found: Evaluation) -> Float[np.ndarray, " n"]:

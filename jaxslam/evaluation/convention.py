@@ -37,7 +37,7 @@ from jaxslam._runtime.files import LARGEST, write_text
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, jacobian, log
 from jaxslam.io.logs import named
-from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, symmetric
+from jaxslam.io.logs.log import MIXED, WHOLE, Log, in_seconds, of_two_cells, symmetric
 from jaxslam.io.logs.unnamed import is_deviations
 from jaxslam.io.text import Table, read_table, without_values
 from jaxslam.io.tum import table_text
@@ -59,8 +59,8 @@ Axes = Int[np.ndarray, " m"]
 
 
 Result = TypeVar("Result")
-BLOCK = 8192
-"""The poses whose matrices are computed at once."""
+BLOCK, AT_ONCE = 8192, 512
+"""The poses whose matrices are computed at once, and those whose errors are."""
 CHOICES = {
     "error": ("right", "left", "split"),
     "axes": ("body", "world", "mixed", "rpy"),
@@ -136,12 +136,11 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
 
 def pose_errors(convention: Convention, estimates: Matrices, truths: Matrices) -> Tangents:
     """The error of every pose in the convention."""
-    T, true = (x.reshape(-1, *x.shape[-2:]) for x in (estimates, truths))
-    result = np.empty((len(T), geometry_of(T).tangent_dim))
+    result = np.asarray(_in_float64(_error, convention.error, estimates, truths))
+    T, e = estimates.reshape(-1, *estimates.shape[-2:]), result.reshape(-1, result.shape[-1])
     for part in blocks(len(T)):
-        error = _in_float64(_error, convention.error, T[part], true[part])
-        result[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), error)
-    return result.reshape(*estimates.shape[:-2], -1)
+        e[part] = np.einsum("kij,kj->ki", turning(convention, T[part]), e[part])
+    return result
 
 
 def truth_derivatives(
@@ -234,15 +233,18 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
 def _in_float64(function: Callable[..., Result], error: str, *arrays: Matrices) -> Result:
     """Apply a function of single poses to all of them, as NumPy's arrays.
 
-    Their number is filled up to a power of two, so that few programs serve logs of all sizes.
+    So many at once, of which the last are repeated, that one program serves logs of all sizes.
     """
-    batch, count = arrays[0].shape[:-2], int(np.prod(arrays[0].shape[:-2]))
-    flat = (np.asarray(x, np.float64).reshape(-1, *x.shape[-2:]) for x in arrays)
-    more = (1 << (count - 1).bit_length()) - count
-    filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
+    batch, flat = arrays[0].shape[:-2], [x.reshape(-1, *x.shape[-2:]) for x in arrays]
+    places = np.minimum(np.arange(-(-len(flat[0]) // AT_ONCE) * AT_ONCE), len(flat[0]) - 1)
     with jax.enable_x64(True):
-        result = jax.device_get(_of_each(function, error, *filled))
-    return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
+        parts = [
+            jax.device_get(_of_each(function, error, *(x[part] for x in flat)))
+            for part in places.reshape(-1, AT_ONCE)
+        ]
+    return jax.tree.map(
+        lambda *x: np.concatenate(x)[: len(flat[0])].reshape(*batch, *x[0].shape[1:]), *parts
+    )
 
 
 def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
@@ -320,6 +322,9 @@ def covariances_of_file(path: str | Path, t: int = 6, *, positions: bool = False
     table = read_table(path, "covariances", "covariances", "a time and finite numbers")
     rows, count = table.rows, table.rows.shape[1]
     told, of_titles, assumed = named.covariances(table, flat=t == 3)
+    one = None if told is not None or count < 3 else of_two_cells(rows)
+    if one is not None:
+        rows, count = one, count - 1
     alone = positions and told is None and count in (4, 7, 10)
     t = 3 if alone else t
     triangle = 1 + t * (t + 1) // 2

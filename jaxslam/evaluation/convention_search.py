@@ -204,9 +204,10 @@ def _best(tried: Mapping[Convention, Tried]) -> tuple[Convention | None, tuple[C
     """The most likely one, and all that cannot be distinguished from it."""
     if not tried:
         return None, ()
-    weight = {c: np.exp(x.log_determinant / x.dof) for c, x in tried.items()}
-    best = min(tried, key=lambda c: weight[c] * float(np.nanmean(tried[c].nees)))
-    weighted = {c: x._replace(nees=weight[c] / weight[best] * x.nees) for c, x in tried.items()}
+    size = {c: x.log_determinant / x.dof for c, x in tried.items()}
+    best = min(tried, key=lambda c: size[c] + np.log(np.nanmean(tried[c].nees) + 1e-300))
+    weight = {c: np.exp(min(size[c] - size[best], 300.0)) for c in tried}
+    weighted = {c: x._replace(nees=weight[c] * x.nees) for c, x in tried.items()}
     return best, tuple(c for c, x in weighted.items() if not _distinguished(x, tried[best]))
 
 

@@ -29,7 +29,7 @@ from jaxslam.evaluation.convention import (
     geometry_of,
     pose_errors,
 )
-from jaxslam.io.logs.log import check_seconds, symmetric
+from jaxslam.io.logs.log import check_seconds, in_degrees, symmetric
 from jaxslam.io.text import read_table, vector_of
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
@@ -51,7 +51,7 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             raise ValueError
-        array = array.astype(np.float64)
+        array = array.astype(np.float64, copy=ndim < 4)  # matrices are large, and no result
     except (ValueError, TypeError):
         raise ValueError(f"{what} must be numbers, an array {shape}") from None
     if array.ndim != ndim or not array.size:
@@ -409,6 +409,8 @@ def without_unknown(P: Squares, *, marked: bool = True) -> Squares:
 def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
     T = numbers(what, given, 3 if np.ndim(given) == 3 else 4, expected)
     if T.ndim == 3 and T.shape[-1] == 3:
+        if all(in_degrees(run[:, 2:], run[:, :2]) for run in T[:10]):
+            raise ValueError(f"{what} have θ in degrees, as their course shows; expected radians")
         T = of_xytheta(T)
     if T.ndim == 3 and T.shape[-1] == 6:
         from scipy.spatial.transform import Rotation  # slow to import

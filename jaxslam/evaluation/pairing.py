@@ -29,8 +29,7 @@ from jaxslam.evaluation.inputs import exactly_known, without_unknown
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
 from jaxslam.io.logs.frames import read_frames
-from jaxslam.io.logs.geodetic import GPS_EPOCH, WEEK
-from jaxslam.io.logs.log import TAKEN, Log, check_seconds, interpolated
+from jaxslam.io.logs.log import GPS_EPOCH, TAKEN, WEEK, Log, check_seconds, interpolated
 from jaxslam.io.tum import Times
 
 Place: TypeAlias = Path | ros.Topic

@@ -160,10 +160,9 @@ class Evaluation:
         if self.causes:
             return self.causes
         numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
-        factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
-        runs = [_run(self, run) for run in range(self.runs)]
-        found = mistakes(Logged(self.errors, self.sigmas, self.names, runs, numbers, factors))
-        return (*found, *gated(self.nees, self.dof)) if self.quantity == "NIS" else found
+        runs, nis = [_run(self, run) for run in range(self.runs)], self.quantity == "NIS"
+        of = self.errors, self.sigmas, self.names, runs, numbers, self.axis_verdict, nis
+        return (*mistakes(Logged(*of)), *(gated(self.nees, self.dof) if nis else ()))
 
     @property
     def headline(self) -> str:

@@ -7,7 +7,7 @@ raises a false alarm.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +15,12 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Bool, Float
 
 from jaxslam._runtime.files import Json
+from jaxslam.io.logs.log import DEGREE
 from jaxslam.statistics.bands import PerAxis, PerStep, shortfall_limit
 from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
 """The largest share of right studies taken for ones with runs and steps interchanged."""
-DEGREES = 180 / np.pi
 _PERIODS = ((2 * np.pi, "2π", "(−π, π]"), (360.0, "360°", "(−180°, 180°]"))
 _FAR, _NEAR = 8.0, 5.0
 """An error beyond so many σ is not one of its axis; within so many of a full turn it is."""
@@ -73,8 +73,9 @@ class Logged(NamedTuple):
     """The names of the runs."""
     steps: Sequence[str]
     """The names of the steps, as `step 7`, from 0, or `0.3 s`."""
-    factors: Sequence[Verdict]
-    """The verdict on every axis, with `interval99`, and `samples` of innovations."""
+    factor: Callable[[int], Verdict]
+    """The verdict on an axis, with `interval99`, and `samples` of innovations."""
+    innovations: bool = False
 
 
 def mistakes(logged: Logged) -> tuple[Mistake, ...]:
@@ -180,11 +181,11 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
     lengths = [axis for axis, kind in enumerate(kinds) if kind is False]
     wrong = {axis: _Factor.of(logged, axis) for axis in (*asked, *lengths)}
     for factor, errors, covariances in (
-        (DEGREES, "degrees", "radians"), (1 / DEGREES, "radians", "degrees"),
+        (1 / DEGREE, "degrees", "radians"), (DEGREE, "radians", "degrees"),
     ):  # fmt: skip
         found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
         if not angles and found == asked:  # σ as a whole may be wrong
-            ends = {axis: logged.factors[axis]["interval99"] for axis in found}
+            ends = {axis: logged.factor(axis)["interval99"] for axis in found}
             # An interval of a verdict, which is of the runs' scatter too, must not be wider.
             found = [x for x, (low, high) in ends.items() if low and high and high < 4.0 * low]
         if not found or (angles and found != angles):
@@ -192,7 +193,7 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         if any(wrong[axis].is_like(factor, known=True) for axis in lengths):
             continue
         names = ", ".join(logged.names[axis] for axis in found)
-        told = f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
+        told = f"{'180/π' if factor > 1 else 'π/180'} is {factor:.3g}"
         yield Mistake(
             f"degrees instead of radians ({names})",
             f"errors of {names} appear to be in {errors} and the covariances in "
@@ -221,7 +222,7 @@ class _Factor(NamedTuple):
         with np.errstate(invalid="ignore", over="ignore"):
             nees = (logged.errors[..., axis] / logged.sigmas[..., axis]) ** 2
             there = ~np.isnan(logged.errors[..., axis])
-            white = logged.factors[axis].get("samples") == "steps"
+            white = logged.innovations and logged.factor(axis)["samples"] == "steps"
             samples = nees[there] if white else nees.mean(axis=1, where=there)
             mean, n = np.mean(samples), len(samples)
             # The probability that the interval misses the factor that all covariances are wrong by.

@@ -20,7 +20,7 @@ from jaxslam.io.lens_files import read_calibration
 from jaxslam.io.logs.log import STEPS, UNITS, unit_of
 from jaxslam.io.pictures import of_eight_bits, orientation
 from jaxslam.io.source import Image, Trajectory
-from jaxslam.io.text import DATE, ISO, numbers, text_lines
+from jaxslam.io.text import numbers, text_lines, with_iso
 from jaxslam.io.tum import not_rigid, read_tum
 
 SINCE_1970 = 1e9
@@ -231,7 +231,7 @@ def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:
 
 
 def _timestamp(place: str, line: str) -> tuple[float, str]:
-    word, *name = re.split(r"[,\s]+", DATE.sub(ISO, line), maxsplit=1)
+    word, *name = re.split(r"[,\s]+", with_iso(line), maxsplit=1)
     time = numbers([word], 1)
     if time is None:
         raise ValueError(f"{place}: expected a finite time and a file, not {line!r}")

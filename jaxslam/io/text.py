@@ -21,9 +21,18 @@ from jaxslam._runtime.files import LARGEST
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
           (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
-DATE = re.compile(r"(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d)")
-"""A date and time, which are a cell, in whatever columns."""
-ISO = r"\1-\2-\3T\4"
+_DATES = tuple(
+    re.compile(rf"(?<![\d.]){date}(?P<h>\d\d)([:-]?)(?P<m>\d\d)\{back}(?P<s>\d\d)(?!\d)")
+    for back, date in (
+        (6, r"(?P<year>\d{4})([-/._])(?P<month>\d\d)\2(?P<day>\d\d)[T _]"),
+        (5, r"(?P<year>\d{4})(?P<month>\d\d)(?P<day>\d\d)T"),
+        (6, r"(?P<day>\d\d)([-.])(?P<month>[A-Z][a-z]{2}|\d\d)\2(?P<year>\d{4})[T _]"),
+    )
+)
+"""Dates and times, which are a cell, in whatever columns: the year first, or the day."""
+_MONTHS = "JanFebMarAprMayJunJulAugSepOctNovDec"
+_ISO = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:")
+_OTHER_DATE = re.compile(r"(?<![\d:])(\d\d?/\d\d?/\d{4}|\d\d?:\d\d:\d\d)")
 _TITLED = "write a table with titles instead, as t,x,y,z,qx,qy,qz,qw, a pose per line"
 _OTHERS = {
     r"[{[]": ("JSON", _TITLED),
@@ -121,13 +130,18 @@ def table_of(path: str | Path, told: Mapping[int, str], holds: str, row: str) ->
         if re.match(mark, next(iter(told.values()), "")):
             raise ValueError(f"{path}: is {kind}, which is not read; {instead}")
     comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
-    lines = {n: DATE.sub(ISO, line) for n, line in told.items() if not _is_comment(line)}
+    lines = {n: with_iso(line) for n, line in told.items() if not _is_comment(line)}
     named = []
     while lines and not any(_number(cell) is not None for cell in cells(lines[min(lines)])):
         named.append(lines.pop(min(lines)))
     if not lines:
         raise ValueError(f"{path} has no {holds}; expected lines of {row}")
     first = lines[min(lines)]
+    if other := _OTHER_DATE.search(_ISO.sub("", first)):
+        raise ValueError(
+            f"{path}, line {min(lines)}: {other[0]} may mean several times; write seconds, or "
+            "dates with times as 2026-11-30T12:00:00"
+        )
     separator = _separator(first)
     count = len(cells(first, separator))
     titles = _titles([*reversed(named), *reversed(comments)], count, separator)
@@ -219,12 +233,25 @@ def numbers_of(told: object) -> list[float]:
 def _number(cell: str) -> float | None:
     """A number, or the seconds from 1970 to a date, of UTC where it says no zone."""
     try:
-        if not DATE.match(cell):
+        if not _ISO.match(cell):
             return float(cell)
         date = datetime.fromisoformat(cell)
         return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
         return None
+
+
+def with_iso(line: str) -> str:
+    """A line whose dates are those of ISO 8601."""
+
+    def iso(found: re.Match[str]) -> str:
+        year, month, *others = found.group("year", "month", "day", "h", "m", "s")
+        month = f"{_MONTHS.find(month) // 3 + 1:02}" if month.isalpha() else month
+        return "{}-{}-{}T{}:{}:{}".format(year, month, *others)
+
+    for date in _DATES:
+        line = date.sub(iso, line)
+    return line
 
 
 def _is_comment(line: str) -> bool:

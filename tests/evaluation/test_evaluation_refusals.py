@@ -9,11 +9,14 @@ from scipy.io import savemat
 import jaxslam
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, read_covariances
 from jaxslam.evaluation.convention import write_covariances
+from jaxslam.io.logs import read_log
 from jaxslam.io.tum import write_tum
 
 E, P = drawn()
 T, POSE_P, TRUTH = logged(Convention(), runs=3)
 STILL = logged(Convention(), spread=0.0)[:2]
+TURNS = np.linspace(0.0, 3.0, 60)
+COURSE = np.column_stack([np.sin(TURNS), 1 - np.cos(TURNS), np.degrees(TURNS)])[None]
 
 
 def changed(values, place, value):
@@ -76,6 +79,8 @@ OF_ARRAYS = [
     (poses(truth=changed(TRUTH, (0, 0, 0, 3), 1e300), align="se3"),
      r"truths contain 1e\+300; the limit is 1e\+100"),
     (poses(T[..., :2, :2]), "estimates must be matrices"),
+    (poses(COURSE, POSE_P[:1, [0] * 60, :3, :3], COURSE),
+     "estimates have θ in degrees, as their course shows; expected radians"),
     (poses(times=np.arange(6) * 10**8), r"times 1e.08 from one to the next look like nanoseconds"),
     (poses(*planar(runs=3)[:3], Convention("split"), axes_used=["x", "yaw"]),
      "unknown axes used 'yaw'; known: x, y, z, rx, ry, rz"),
@@ -100,6 +105,13 @@ def test_what_is_nearly_singular_or_rounded_or_large_is_no_fault():
 
 
 # --- files: each row writes into a folder, and reads ---------------------------------------------
+
+
+@pytest.mark.parametrize("time", ["05/03/2023 12:00:01", "12:00:01 1"])
+def test_dates_that_may_mean_several_times_are_refused_by_what_they_are(time, tmp_path):
+    path = tmp_path / "log.txt"
+    path.write_text(f"{time} 0 0 0 0 0 0 1\n")
+    refused(lambda: read_log(path), f"line 1: {time.split()[0]}.* may mean several times")
 
 
 def csv(text):

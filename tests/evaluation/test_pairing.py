@@ -7,10 +7,12 @@ import pytest
 from log_faults import flight
 from logs import logged, planar
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, evaluate_poses
 from jaxslam.evaluation.convention import write_covariances
+from jaxslam.io.logs import read_log
 from jaxslam.io.tum import quaternions, write_tum
 
 LOG = flight(np.random.default_rng(4), 1, 30)
@@ -24,6 +26,16 @@ def files(folder, true=slice(None), own=slice(None), late=0.0):
     write_covariances(folder / "covariance.txt", times, LOG.covariances[0, own], LOG.convention)
     write_tum(folder / "truth.txt", LOG.dense_times[true] + late, LOG.dense[0, true])
     return folder
+
+
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("order", [[0, 1, 2, 5, 4, 3], [5, 4, 3, 0, 1, 2], [0, 1, 2, 3, 4, 5],
+                                   [3, 4, 5, 0, 1, 2]])  # fmt: skip
+def test_which_columns_are_places_and_which_is_the_yaw_is_told_by_the_course(order, unit, tmp_path):
+    angles = unit * Rotation.from_matrix(LOG.dense[0, :, :3, :3]).as_euler("ZYX")
+    rows = np.column_stack([LOG.dense[0, :, :3, 3], angles])[:, order]
+    np.savetxt(tmp_path / "log.txt", np.column_stack([LOG.dense_times, rows]))
+    np.testing.assert_allclose(read_log(tmp_path / "log.txt").poses, LOG.dense[0], atol=1e-9)
 
 
 @pytest.mark.parametrize("true", [slice(None), slice(0, None, 3)])

@@ -12,7 +12,7 @@ TEXTS = [name for name in LOGS if not (name.startswith(("npz", "mat", "bag")) or
 UNSAID = {
     "TUM and a triangle", "TUM, variances by titles", "titles of angles in degrees, and σ",
     "titles of PlotJuggler and ROS 2", "titles of ROS' CSV with covariances", "titles of PX4",
-    "echo of ROS 2",
+    "echo of ROS 2", "titles of deviations", "titles of an information matrix",
 }  # fmt: skip
 """Logs that do not say of which error their covariances are."""
 TABLES = [name for name in TEXTS if name.startswith("CSV")]

@@ -13,15 +13,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.io.logs.log import Log, symmetric
+from jaxslam.io.logs.log import GPS_EPOCH, WEEK, Log, symmetric
 from jaxslam.io.text import Table, table_of
 from jaxslam.io.tum import Times, transforms
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """The ellipsoid of WGS 84: its radius at the equator, m, and its flattening."""
-GPS_EPOCH = 315964800.0
-"""Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
-WEEK = 604800.0
 SAID = {"error": "split", "axes": "body"}
 ENU, GPS_TIME = "x, y, z are east, north and up", "times are those of GPS"
 _RTKLIB = {

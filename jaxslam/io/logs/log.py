@@ -10,11 +10,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.io.text import Table, without_values
 from jaxslam.io.tum import Times, of_xytheta, rows_as_poses
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
+DAY = 86400.0
+_EPOCHS = 719529.0, 2440587.5, 40587.0, 25569.0
+"""1970-01-01 in days of MATLAB, in Julian and modified Julian ones, and in Excel's."""
+_OURS = (9.4e8, 2.21e9)
+"""Seconds since 1970 of 2000 to 2040."""
+GPS_EPOCH = 315964800.0
+"""Seconds of 1970-01-01 to 1980-01-06, from which GPS counts weeks; both without leap seconds."""
+WEEK = 604800.0
 STEPS = (1e-3, 10.0)
 """The time from a pose to the next, s, which shows the unit of times."""
 MIXED = {"error": "split", "axes": "mixed"}
@@ -26,6 +35,8 @@ TAKEN = "no title says the unit of its angles: they are taken as {}"
 DEGREE = np.pi / 180
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
+ALONG = 0.7
+"""From how well on headings are `along_course`."""
 _SINCE = (1e8, 4e9)
 """Seconds since 1970, or since the epoch of GPS, of our time."""
 
@@ -112,18 +123,12 @@ def of_angles(of: Callable[[Rows], Log], angles: Rows, places: Rows, title: str)
 def in_degrees(angles: Rows, places: Rows) -> bool:
     """Whether angles, the yaw first, are degrees: only so the heading is along the course,
     forwards or backwards, which turns; or as radians they would leap by half a turn."""
-    there = np.isfinite(angles).all(axis=1) & np.isfinite(places).all(axis=1)
-    a, p = angles[there], places[there]
+    radians, degrees = along_course(angles[:, 0], places)
+    if max(radians, degrees) > ALONG:
+        return degrees > radians
+    a = angles[np.isfinite(angles).all(axis=1)]
     largest, leap = np.abs(a).max(initial=0.0), np.abs(np.diff(a, axis=0)).max(initial=0.0)
-    every = max(len(a) // 200, 1)
-    along = (p[every:] - p[:-every]) @ [1, 1j]
-    yaw, length = a[every // 2 :][: len(along), 0], max(float(np.abs(along).sum()), 1e-9)
-    still, radians, degrees = (
-        abs(np.sum(np.abs(along) * np.exp(2j * (x * yaw - np.angle(along))))) / length
-        for x in (0.0, 1.0, DEGREE)
-    )
-    by_course = still < 0.9 and max(radians, degrees) > 0.95
-    return bool(degrees > radians if by_course else largest > 2 * np.pi + 0.1 and leap > np.pi)
+    return bool(largest > 2 * np.pi + 0.1 and leap > np.pi)
 
 
 def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple[str, ...]]:
@@ -135,6 +140,9 @@ def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple
     table.check(~np.isfinite(times), "a finite time")
     if unit := unit or unit_in("".join(table.titles[:1])):
         return times * UNITS[unit], ()
+    days = [x for x in _EPOCHS if _OURS[0] < (times[0] - x) * DAY < _OURS[1]]
+    if days and 0 < _step(times) < STEPS[0] / 2:
+        return (times - days[0]) * DAY, (f"{table.path}: times are taken as days",)
     try:
         check_seconds(str(table.path), times)
     except ValueError:
@@ -143,6 +151,39 @@ def in_seconds(table: Table, times: Times, unit: str = "") -> tuple[Times, tuple
             raise
         return times * UNITS[unit], (f"{table.path}: times are taken as {unit}",)
     return times, ()
+
+
+def of_two_cells(rows: Rows) -> Rows | None:
+    """Rows whose stamps, in two cells, are one: whole seconds and nanoseconds, or the week of GPS
+    and its seconds; None of others."""
+    first, second = rows[:, 0], rows[:, 1]
+    if not ((first == np.floor(first)) & (second >= 0)).all():
+        return None
+    if (first >= _SINCE[0]).all() and (second == np.floor(second)).all() and second.max() < 1e9:
+        return np.column_stack([first + 1e-9 * second, rows[:, 2:]])
+    unit = UNITS["ms" if second.max() >= WEEK else "s"]
+    if not ((first > 1000) & (first < 5000) & (unit * second < WEEK)).all():
+        return None
+    return np.column_stack([GPS_EPOCH + WEEK * first + unit * second, rows[:, 2:]])
+
+
+def along_course(
+    yaw: Float[np.ndarray, " n"], places: Rows, units: Sequence[float] = (1.0, DEGREE)
+) -> list[float]:
+    """How well headings in these units are along the course, forwards or backwards: from 0, as well
+    as one that never turns, to 1. Over the steps that show it best, as places are noisy."""
+    there = np.isfinite(yaw) & np.isfinite(places).all(axis=1)
+    a, p, best = yaw[there], np.clip(places[there], -LARGEST, LARGEST), np.zeros(len(units))
+    for every in (max(len(a) // part, 1) for part in (200, 60, 20)):
+        along = (p[every:] - p[:-every]) @ [1, 1j]
+        middle, length = a[every // 2 :][: len(along)], max(float(np.abs(along).sum()), 1e-9)
+        still, *found = (
+            float(abs(np.sum(np.abs(along) * np.exp(2j * (x * middle - np.angle(along)))))) / length
+            for x in (0.0, *units)
+        )
+        if still < 0.9:  # of a course that turns
+            best = np.maximum(best, (np.array(found) - still) / (1 - still))
+    return best.tolist()
 
 
 def unit_in(title: str) -> str:

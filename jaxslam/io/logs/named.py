@@ -22,6 +22,7 @@ from jaxslam.io.logs.log import (
     in_seconds,
     log,
     of_angles,
+    of_two_cells,
     planar,
     symmetric_or_none,
     unit_in,
@@ -48,12 +49,14 @@ _EARTH = {
 _OTHERS = {"twist", "vel", "velocity", "linear", "angular", "acc", "acceleration", "bias"}
 _TIME = re.compile(
     r"(?:.*_)?(?P<nano>n(?:ano)?secs?)|(?P<header>(?:.*_)?stamp(?:_secs?)?|timestamp_sample)"
-    r"|(?:(?:utc|gps|ros)_?)?(?P<t>t|ts|time|timestamps?|secs?|seconds)(?:_?[num]?s(?:ecs?)?)?"
+    r"|(?:(?:utc|gps|ros)_?)?(?P<t>t|ts|time|[ts]ow|timestamps?|secs?|seconds)(?:_?[num]?s(?:ecs?)?)?"
 )
 _AXIS = r"roll|pitch|yaw|heading|phi|theta|psi|th|θ|r_?[xyz]|[xyzrpth]"
+_DEVIATION = "sigma|sig|std_?dev|std|stdev|sd|dev|unc|uncertainty"
 _SPREAD = re.compile(
     r"q(?P<cnspy>[rpy]{2})|(?:[pc]|(?:.*_)?(?:(?P<cov>cov|covariance)|(?P<var>var|variance))"
-    r"|(?P<sigma>s|σ|(?:.*_)?(?:sigma|std_?dev|std|stdev|sd)))_?"
+    r"|(?:.*_)?(?P<inverse>i|inf|info|information|omega)"
+    rf"|(?P<sigma>s|σ|(?:.*_)?(?:{_DEVIATION})))_?"
     rf"(?:(?P<number>\d+(?:_\d+)?)|(?P<first>{_AXIS})_?(?P<second>{_AXIS})?)"
 )
 _ORDER = {"x": 0, "y": 1, "z": 2, **dict.fromkeys(("roll", "phi", "rx", "r"), 3),
@@ -80,6 +83,10 @@ def read(table: Table) -> Log | None:
     titles = {name: table.titles[i] for name, i in named.items()}
     expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
     times, unit = table.numbers(expected, [named["t"]]), unit_in(titles["t"])
+    weeks = [i for i, x in enumerate(map(words, table.titles)) if re.fullmatch("(gps_?)?week", x)]
+    if weeks:
+        one = of_two_cells(np.column_stack([table.numbers(expected, weeks[:1]), times]))
+        times, unit = (times, unit) if one is None else (one, "s")
     if "nano" in named and rows[:, named["nano"]].max() < 1e9:
         times, unit = times + 1e-9 * table.numbers(expected, [named["nano"]]), "s"
     P, said, assumed = covariances(table, flat=flat)
@@ -156,11 +163,13 @@ def _spread(told: str) -> re.Match[str] | None:
     told = re.sub(r"(?:^|_)(?:rot|rotation|ori|orientation|att|attitude)_(.*_)?([xyz])$",
                   r"_\1r\2", told).strip("_")  # fmt: skip
     told = re.sub(r"_(?:p|pos|position|trans|translation)_([xyz])$", r"_\1", told)
+    told = re.sub(rf"^(.*?)_?({_DEVIATION}|var|variance)$", r"\2_\1", told)
     found = _SPREAD.fullmatch(told)
     if found is None:
         return None
     one, alone = found["sigma"] or found["var"], found["first"] and not found["second"]
-    return found if bool(alone) == bool(one) or (found["cov"] and alone) else None
+    fits = bool(alone) == bool(one) and not (found["inverse"] and alone)
+    return found if fits or (found["cov"] and alone) else None
 
 
 def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]:
@@ -189,6 +198,10 @@ def covariances(table: Table, *, flat: bool) -> tuple[Stack | None, Words, bool]
     if not {(i, i) for i in range(3 - flat)} <= cells.keys():
         return None, NOTHING, False
     P = symmetric_or_none(table, np.column_stack([*cells.values()]), [*cells])
+    if any(x["inverse"] for x in told.values()):
+        axes_told = sorted({i for i, j in cells if i == j})
+        block = np.ix_(~np.isnan(P[:, 0, 0]), axes_told, axes_told)
+        P[block] = np.linalg.pinv(P[block], hermitian=True)
     for i in {*range(6)} - {i for i, j in cells if i == j}:
         P[~np.isnan(P[:, 0, 0]), i, i] = -1.0
     if flat:

@@ -9,11 +9,14 @@ from jaxtyping import Float
 
 from jaxslam.io.logs import named
 from jaxslam.io.logs.log import (
+    ALONG,
     MIXED,
     NOTHING,
     Log,
+    along_course,
     in_seconds,
     log,
+    of_two_cells,
     planar,
     symmetric,
     symmetric_or_none,
@@ -119,25 +122,48 @@ def _w_first(table: Table) -> Log | None:
     return found._replace(notes=(*found.notes, note))
 
 
-_STAMPED = {7: "t x y z roll pitch yaw", 9: "sec nsec x y z qx qy qz qw"}
-_STAMPED[17] = (
-    f"sec nsec status service lat lon alt {' '.join(f'covariance{i}' for i in range(9))} type"
-)
-_STAMPED[45] = _STAMPED[87] = f"{_STAMPED[9]} {' '.join(f'covariance{i}' for i in range(36))}"
-"""The titles of so many numbers: of NCLT, and of `ros2 topic echo --csv`, also of a twist or of
-NavSatFix."""
+_STAMPED = {8: "t x y z qx qy qz qw"}
+_STAMPED[16] = f"t status service lat lon alt {' '.join(f'covariance{i}' for i in range(9))} type"
+_STAMPED[44] = _STAMPED[86] = f"{_STAMPED[8]} {' '.join(f'covariance{i}' for i in range(36))}"
+"""The titles of so many numbers whose stamp is in two cells: of `ros2 topic echo --csv`, also of a
+twist or of NavSatFix, and of weeks of GPS."""
+_ANGLES = (
+    "t x y z roll pitch yaw", "t roll pitch yaw x y z", "t x y z yaw pitch roll",
+    "t yaw pitch roll x y z",
+)  # fmt: skip
+"""The orders of positions and angles: of NCLT, of FAST-LIO, and of others."""
 
 
 def _as_titled(table: Table) -> Log | None:
-    """Lines of these numbers, and maybe of frames, by their titles."""
-    blank = [2] if np.isnan(table.rows[:, 2:3]).all() else []  # a frame without a name
-    rows = np.delete(table.rows, [*table.words, *blank], axis=1)
-    titles = tuple(_STAMPED.get(rows.shape[1], "").split())
-    whole, turn = rows[:, :2] == np.floor(rows[:, :2]), np.hypot.reduce(rows[:, 3:7], axis=1)
-    # No whole seconds and nanoseconds; or a quaternion, without a time.
-    if (np.abs(turn - 1) < _LENGTH).all() if len(titles) == 7 else not whole.all():
+    """Lines of a stamp in two cells, and maybe of a frame, by their titles."""
+    if table.rows.shape[1] < 9:
         return None
-    return named.read(table._replace(titles=titles, rows=rows, words={}))
+    blank = [2] if np.isnan(table.rows[:, 2]).all() else []  # a frame without a name
+    one = of_two_cells(np.delete(table.rows, [*table.words, *blank], axis=1))
+    if one is None or one.shape[1] not in _STAMPED:
+        return None
+    titles = tuple(_STAMPED[one.shape[1]].split())
+    return named.read(table._replace(titles=titles, rows=one, words={}))
+
+
+def _of_angles(table: Table) -> Log | None:
+    """Lines of a time, a position and three angles, in the one of `_ANGLES` whose yaw is along the
+    course; or whose angles are bounded where the others' are not."""
+    rows = table.rows
+    if rows.shape[1] != 7 or (np.abs(np.hypot.reduce(rows[:, 3:7], axis=1) - 1) < _LENGTH).all():
+        return None  # a quaternion, without a time
+
+    def fits(order: str) -> float:
+        x, y, yaw = (rows[:, order.split().index(name)] for name in ("x", "y", "yaw"))
+        return max(along_course(yaw, np.column_stack([x, y])))
+
+    first, *others = _ANGLES
+    best = max(others, key=fits)
+    bound = [np.abs(rows[:, part]).max() < 2 * np.pi for part in (slice(1, 4), slice(4, 7))]
+    found = best if fits(best) > max(ALONG, fits(first)) else first
+    if max(map(fits, _ANGLES)) <= ALONG and bound == [True, False]:
+        found = others[0]
+    return named.read(table._replace(titles=tuple(found.split())))
 
 
 def _positions(table: Table) -> Log:
@@ -147,7 +173,11 @@ def _positions(table: Table) -> Log:
 
 
 FORMATS: tuple[tuple[str, Reader], ...] = (
-    ("sec nsec x y z qx qy qz qw and maybe ROS' covariance; t x y z roll pitch yaw", _as_titled),
+    (
+        "sec nsec (or a week of GPS and its seconds) x y z qx qy qz qw and maybe ROS' covariance",
+        _as_titled,
+    ),
+    ("t x y z roll pitch yaw, or the angles first", _of_angles),
     ("KITTI, 12 numbers, or 13 and 17 with a time", _kitti),
     ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
     ("TUM, 8 numbers", _of(8, _tum)),
