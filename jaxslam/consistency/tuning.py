@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray, cast, is_number
@@ -69,7 +70,7 @@ class LogFit:
     mean: float | None
     """The largest of the means of the numbers of a whitened innovation: 0 of a right filter."""
     p: float | None
-    """The p of white innovations; None of too few."""
+    """The p of white innovations without a mean; None of too few."""
     left_out: float
     """The share of measurements that were not used."""
 
@@ -512,7 +513,9 @@ def _fit_and_sums(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> tuple[Lo
 
 
 def _whiteness(white: list[np.ndarray]) -> tuple[float | None, float | None, float | None]:
-    """The correlation of neighbours, the largest mean, and the p of independent innovations."""
+    """The correlation of neighbours, the largest mean, and the p of white innovations without one:
+    twice the least of that of neighbours and that of `Σ nᵢ m̄ᵢ²`, which is χ², over the means of all
+    numbers of all slots of all logs."""
     steps = max(len(x) for x in white)
     rows = np.concatenate([
         np.pad(np.swapaxes(x, 0, 1), ((0, 0), (0, steps - len(x)), (0, 0)), constant_values=np.nan)
@@ -528,4 +531,9 @@ def _whiteness(white: list[np.ndarray]) -> tuple[float | None, float | None, flo
     means = np.sum(filled, axis=(0, 1)) / np.sum(there)
     largest = means[np.argmax(np.abs(means))]
     p = whiteness_p_value(np.where(there, np.sum(filled**2, axis=-1), np.nan), rows)
+    if p is not None:
+        sums, count = np.sum(filled, axis=1), np.sum(there, axis=1)[:, None]
+        chi2 = np.sum(sums**2 / np.maximum(count, 1))
+        dof = sums.shape[1] * np.sum(count > 0)
+        p = min(1.0, 2 * min(p, float(scipy.special.gammaincc(dof / 2, chi2 / 2))))
     return float(correlation), float(largest), p
