@@ -137,7 +137,7 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
 
     functions = (
         row, mean, sigma, lost, end, theirs, told, along, observed, initialised, walked,
-        believed, filmed, accused, cautious, shown, on_gpu,
+        believed, filmed, accused, cautious, shown, on_gpu, sot,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 

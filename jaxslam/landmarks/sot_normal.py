@@ -1,6 +1,6 @@
-"""Points in normal coordinates of SOT(n), the landmarks of the equivariant filter (van Goor, Mahony,
-Hamel, Trumpf: Constructive Observer Design for Visual SLAM, Automatica 2021; van Goor, Mahony:
-EqVIO, T-RO 2023).
+"""Points in normal coordinates of SOT(n), as in the equivariant filter (van Goor, Mahony, Hamel,
+Trumpf: Constructive Observer Design for Visual SLAM, Automatica 2021; van Goor, Mahony: EqVIO,
+T-RO 2023).
 
 Scaled rotations SOT(n) = SO(n) × R⁺ act on points in the camera frame. The error of one is such an
 element, `p ← e^l Exp(θ) p`. Parameters: (m, λ), n + 1 numbers: a ray and the logarithm of the
