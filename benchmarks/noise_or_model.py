@@ -127,6 +127,7 @@ def tuned(
 
     def biased(log: MeasuredRun) -> MeasuredRun:
         frames = log.frames
+        assert log.first is not None
         first, seen, new = (
             replace(x, measured=x.measured + off) for x in (log.first, frames.seen, frames.new)
         )

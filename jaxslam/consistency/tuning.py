@@ -415,16 +415,15 @@ def _mean_cost(theta: Float[Array, " k"], given: _Given) -> Float[Array, ""]:
     return (sum(costs[1:], start=costs[0]) + given.search.prior_cost(theta)) / given.count
 
 
-def _with_slope(theta: Float[Array, " k"], given: _Given) -> tuple[Array, Array]:
-    """The gradient at once, by as many tangents as there are numbers, and the value: linearised
-    through all frames it would keep every matrix of every frame."""
-    return jax.jacfwd(lambda t: 2 * (_mean_cost.fun(t, given),), has_aux=True)(theta)
-
-
 @_mean_cost.defjvp
 def _(at, moved):
-    slope, value = _with_slope(*at)
+    """The gradient at once, by as many tangents as there are numbers: linearised through all frames
+    it would keep every matrix of every frame."""
+    slope, value = jax.jacfwd(lambda t: 2 * (_mean_cost.fun(t, at[1]),), has_aux=True)(at[0])
     return value, slope @ moved[0]
+
+
+_slope = eqx.filter_jit(jax.jacfwd(_mean_cost.fun))
 
 
 @eqx.filter_jit
@@ -440,9 +439,6 @@ def _minimum(given: _Given, settings: TuningSettings) -> tuple[Float[Array, " k"
         throw=False,
     )
     return solution.value, solution.result == optimistix.RESULTS.successful
-
-
-_slope = eqx.filter_jit(lambda *at: _with_slope(*at)[0])
 
 
 def _minimised(

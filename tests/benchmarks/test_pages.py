@@ -27,8 +27,8 @@ RESULTS = read(Path("benchmarks/results"))
 OF_RESULTS = [page for page in pages() if MARK.search(page.read_text())]
 WRITERS = [
     CalibrationStudy, Consistency, Disturbances, Endurance, FromRest, Handheld, NoiseOrModel, OnGpu,
-    OneRunStudy, Parametrizations, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps, Tables,
-    Verdicts,
+    OneRunStudy, Parametrizations, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps,
+    Tables, Verdicts,
 ]  # fmt: skip
 SAID = {
     "the best of all parametrizations": """min(
