@@ -59,6 +59,13 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         rows = files["published"]["rows"]
         return [x["ours"] for x in rows if (x["study"], x["filter"]) == (study, name)]
 
+    def sot(scenario: str) -> list[float]:
+        """NEES and the share of lost runs of three parametrizations."""
+        rows = files["comparison"]["scenarios"][scenario]
+        names = ("inverse_scaling", "image_plane", "sot_normal")
+        each = (rows[f"robocentric/{name}"] for name in names)
+        return [row[key] for row in each for key in ("nees", "lost")]
+
     def told() -> list[int]:
         """How many published values there are, and how many are within our interval."""
         within = [x["within"] for x in files["published"]["rows"] if x["theirs"] is not None]
@@ -130,7 +137,7 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
 
     functions = (
         row, mean, sigma, lost, end, theirs, told, along, observed, initialised, walked,
-        believed, filmed, accused, cautious, shown, on_gpu,
+        believed, filmed, accused, cautious, shown, on_gpu, sot,
     )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 

@@ -133,6 +133,8 @@ ZHANG = (
     Quantity("NEES of orientation", "orientation"),
     Quantity("NEES of pose", "pose"),
 )
+SOT: dict[str, Published] = {"robocentric/sot_normal": None}
+"""The equivariant filter, which no table has."""
 SLAMTB, HUANG = "slamtb (Solà)", "Barrau, Bonnabel 2015; Huang et al. 2010"
 RAL, SONG = "Zhang et al. 2017", "Song et al. 2024"
 
@@ -151,13 +153,13 @@ def cartesian(**theirs: Published) -> dict[str, Published]:
 
 def positions(of: str, /, **theirs: Published) -> Study:
     """A table of Barrau and Bonnabel, and filters that it has not."""
-    beside = cartesian(fej=None, fej2=None, decoupled=None)
+    beside = cartesian(fej=None, fej2=None, decoupled=None) | SOT
     return Study(HUANG, partial(scenario, of), 100, 300, POSITIONS, cartesian(**theirs) | beside)
 
 
 def zhang_of(share: float, /, **theirs: Published) -> Study:
     """A table of Zhang et al., and filters that it has not."""
-    beside = cartesian(robocentric=None, oc=None, fej2=None, decoupled=None)
+    beside = cartesian(robocentric=None, oc=None, fej2=None, decoupled=None) | SOT
     world = partial(zhang, share)
     return Study(RAL, world, 100, 8, ZHANG, cartesian(**theirs) | beside, batch=None)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import scipy  # of which `special` is imported when it is first used
+from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray, cast, is_number
 from jaxslam._runtime.lookup import lookup
@@ -69,7 +70,7 @@ class LogFit:
     mean: float | None
     """The largest of the means of the numbers of a whitened innovation: 0 of a right filter."""
     p: float | None
-    """The p of white innovations; None of too few."""
+    """The p of white innovations without a mean; None of too few."""
     left_out: float
     """The share of measurements that were not used."""
 
@@ -187,14 +188,14 @@ def tune(
     dtype = jnp.result_type(float)
     slam, logs, held_out = cast(slam, dtype), cast(logs, dtype), cast(held_out, dtype)
     search = _Search.of(slam, names, bounds, priors, settings)
-    groups = _grouped(logs)
     before, sums = _fit_and_sums(slam, logs)
     if not math.isfinite(before.log_likelihood):
         raise ValueError(
             "the filter diverges in these logs with the numbers that it starts with; start from "
             "larger σ"
         )
-    theta, converged, hessian = _minimised(search, groups, *_outliers(sums, settings), settings)
+    given = _Given(search, _grouped(logs), *_outliers(sums, settings))
+    theta, converged, hessian = _minimised(given, settings)
     tuned, found = search.filter_of(theta), search.values(theta)
     spread = search.sigmas(theta, hessian)
     aside = (fit_of(slam, held_out), fit_of(tuned, held_out)) if held_out else None
@@ -321,15 +322,20 @@ def _limits(name, value, logarithmic: bool, bounds, prior, settings: TuningSetti
 
 
 def _grouped(logs: Sequence[MeasuredRun]) -> list[MeasuredRun]:
-    """Batches of logs, each padded by frames and features that measure nothing to the longest."""
-    capacity = Capacity(*np.max([log.capacity for log in logs], axis=0).tolist())
-    steps = max(log.frames.seen.valid.shape[0] for log in logs)
+    """Batches of logs that are alike."""
     alike: dict[object, list[MeasuredRun]] = {}
-    for log in logs:
-        log = _padded(log, steps, capacity)
+    for log in _of_one_length(logs):
         leaves, structure = jax.tree.flatten(log)
         alike.setdefault((structure, *map(np.shape, leaves)), []).append(log)
     return [jax.tree.map(lambda *x: jnp.stack(x), *same) for same in alike.values()]
+
+
+def _of_one_length(logs: Sequence[MeasuredRun]) -> list[MeasuredRun]:
+    """Logs padded by frames and features that measure nothing to the longest, so that one program
+    serves all."""
+    capacity = Capacity(*np.max([log.capacity for log in logs], axis=0).tolist())
+    steps = max(log.frames.seen.valid.shape[0] for log in logs)
+    return [_padded(log, steps, capacity) for log in logs]
 
 
 def _padded(log: MeasuredRun, steps: int, capacity: Capacity) -> MeasuredRun:
@@ -345,10 +351,10 @@ def _padded(log: MeasuredRun, steps: int, capacity: Capacity) -> MeasuredRun:
 
     seen = features(log.frames.seen, capacity.seen)
     new = features(log.frames.new, capacity.new)
-    control, gone = jax.tree.map(longer, (log.frames.control, log.frames.gone))
+    control, gone, truth = jax.tree.map(longer, (log.frames.control, log.frames.gone, log.truth))
     if gone is not None:
         gone = jnp.pad(gone, ((0, 0), (0, capacity.landmarks - gone.shape[1])))
-    return MeasuredRun(Frames(control, seen, new, gone), capacity, log.first, log.known)
+    return replace(log, frames=Frames(control, seen, new, gone), capacity=capacity, truth=truth)
 
 
 class _Records(NamedTuple):
@@ -391,49 +397,59 @@ def _outliers(total: _Records, settings: TuningSettings) -> tuple[Float[Array, "
     return jnp.asarray(cost), float(total.dof + total.left_out)
 
 
-def _minimised(
-    search: _Search,
-    groups: list[MeasuredRun],
-    outlier: Float[Array, ""],
-    count: float,
-    settings: TuningSettings,
-) -> tuple[Float[Array, " k"], bool, np.ndarray]:
-    """The likeliest θ, whether it was found, and the Hessian of minus the log likelihood there."""
+class _Given(NamedTuple):
+    """The data of a search."""
+
+    search: _Search
+    groups: list[MeasuredRun]
+    outlier: Float[Array, ""]
+    count: float
+    """The number of all that was measured."""
+
+
+@jax.custom_jvp
+def _mean_cost(theta: Float[Array, " k"], given: _Given) -> Float[Array, ""]:
+    """Minus the log likelihood, and the priors', of one number that was measured."""
+    slam = given.search.filter_of(theta)
+    costs = [_cost(slam, group, given.outlier) for group in given.groups]
+    return (sum(costs[1:], start=costs[0]) + given.search.prior_cost(theta)) / given.count
+
+
+@_mean_cost.defjvp
+def _(at, moved):
+    """The gradient at once, by as many tangents as there are numbers: linearised through all frames
+    it would keep every matrix of every frame."""
+    slope, value = jax.jacfwd(lambda t: 2 * (_mean_cost.fun(t, at[1]),), has_aux=True)(at[0])
+    return value, slope @ moved[0]
+
+
+_slope = eqx.filter_jit(jax.jacfwd(_mean_cost.fun))
+
+
+@eqx.filter_jit
+def _minimum(given: _Given, settings: TuningSettings) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
     import optimistix
 
-    def mean_cost(theta, given):
-        search, groups, outlier = given
-        slam = search.filter_of(theta)
-        costs = [_cost(slam, group, outlier) for group in groups]
-        return (sum(costs[1:], start=costs[0]) + search.prior_cost(theta)) / count
-
-    # A gradient at once, by as many tangents as there are numbers: linearised through all frames
-    # it would keep every matrix of every frame.
-    smooth = jax.custom_jvp(mean_cost)
-
-    @smooth.defjvp
-    def _(at, moved):
-        slope, value = jax.jacfwd(lambda t: 2 * (mean_cost(t, at[1]),), has_aux=True)(at[0])
-        return value, slope @ moved[0]
-
-    tolerance = settings.tolerance
-    given = (search, groups, outlier)
-    solution = eqx.filter_jit(optimistix.minimise)(
-        smooth,
-        optimistix.BFGS(rtol=tolerance, atol=tolerance),
-        search.first,
+    solution = optimistix.minimise(
+        _mean_cost,
+        optimistix.BFGS(rtol=settings.tolerance, atol=settings.tolerance),
+        given.search.first,
         args=given,
         max_steps=settings.steps,
         throw=False,
     )
-    slope, width = eqx.filter_jit(jax.jacfwd(mean_cost)), 1e-4
-    rows = [
-        np.asarray(slope(solution.value + h, given) - slope(solution.value - h, given))
-        for h in width * np.eye(len(search.first))
-    ]
-    hessian = np.array(rows) / (2 * width) * count
-    found = solution.result == optimistix.RESULTS.successful
-    return solution.value, bool(found), (hessian + hessian.T) / 2
+    return solution.value, solution.result == optimistix.RESULTS.successful
+
+
+def _minimised(
+    given: _Given, settings: TuningSettings
+) -> tuple[Float[Array, " k"], bool, np.ndarray]:
+    """The likeliest θ, whether it was found, and the Hessian of minus the log likelihood there."""
+    theta, found = _minimum(given, settings)
+    steps = 1e-4 * np.eye(len(theta))
+    rows = [np.asarray(_slope(theta + h, given) - _slope(theta - h, given)) for h in steps]
+    hessian = np.array(rows) / 2e-4 * given.count
+    return theta, bool(found), (hessian + hessian.T) / 2
 
 
 class _OfFrames(NamedTuple):
@@ -469,13 +485,17 @@ def fit_of(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> LogFit:
 
 def _fit_and_sums(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> tuple[LogFit, _Records]:
     """How well it does, and the sums of the records of all frames."""
-    runs = [_run_records(slam, log) for log in logs]
+    lengths = [log.frames.seen.valid.shape[0] for log in logs]
+    runs = [
+        jax.tree.map(lambda x, steps=steps: np.asarray(x)[:steps], _run_records(slam, log))
+        for log, steps in zip(_of_one_length(logs), lengths, strict=True)
+    ]
     total = _Records(*np.sum([[np.sum(part) for part in found] for found, _ in runs], axis=0))
-    nees = [np.asarray(of.nees) for _, of in runs if of.nees is not None]
+    nees = [of.nees for _, of in runs if of.nees is not None]
     degrees = [log.truth.tangent_dim for log in logs if log.truth is not None]
     correlation = mean = p = None
     if all(of.white is not None for _, of in runs):
-        correlation, mean, p = _whiteness([np.asarray(of.white) for _, of in runs])
+        correlation, mean, p = _whiteness([of.white for _, of in runs])
     fit = LogFit(
         log_likelihood=-float(total.cost),
         nis=float(total.nis / total.dof) if total.dof else math.nan,
@@ -489,7 +509,9 @@ def _fit_and_sums(slam: AbstractFilter, logs: Sequence[MeasuredRun]) -> tuple[Lo
 
 
 def _whiteness(white: list[np.ndarray]) -> tuple[float | None, float | None, float | None]:
-    """The correlation of neighbours, the largest mean, and the p of independent innovations."""
+    """The correlation of neighbours, the largest mean, and the p of white innovations without one:
+    twice the least of that of neighbours and that of `Σ nᵢ m̄ᵢ²`, which is χ², over the means of all
+    numbers of all slots of all logs."""
     steps = max(len(x) for x in white)
     rows = np.concatenate([
         np.pad(np.swapaxes(x, 0, 1), ((0, 0), (0, steps - len(x)), (0, 0)), constant_values=np.nan)
@@ -505,4 +527,9 @@ def _whiteness(white: list[np.ndarray]) -> tuple[float | None, float | None, flo
     means = np.sum(filled, axis=(0, 1)) / np.sum(there)
     largest = means[np.argmax(np.abs(means))]
     p = whiteness_p_value(np.where(there, np.sum(filled**2, axis=-1), np.nan), rows)
+    if p is not None:
+        sums, count = np.sum(filled, axis=1), np.sum(there, axis=1)[:, None]
+        chi2 = np.sum(sums**2 / np.maximum(count, 1))
+        dof = sums.shape[1] * np.sum(count > 0)
+        p = min(1.0, 2 * min(p, float(scipy.special.gammaincc(dof / 2, chi2 / 2))))
     return float(correlation), float(largest), p

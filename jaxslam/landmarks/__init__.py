@@ -10,6 +10,7 @@ from jaxslam.landmarks.inverse_depth_to_cartesian import InverseDepthToCartesian
 from jaxslam.landmarks.inverse_scaling import InverseScaling
 from jaxslam.landmarks.landmark import AbstractLandmark
 from jaxslam.landmarks.parallax_angle import ParallaxAngle
+from jaxslam.landmarks.sot_normal import SotNormal
 from jaxslam.landmarks.unit_homogeneous import UnitHomogeneous
 
 LANDMARKS: dict[str, AbstractLandmark] = {
@@ -24,6 +25,7 @@ LANDMARKS: dict[str, AbstractLandmark] = {
         InverseDepthToCartesian(),
         ParallaxAngle(),
         ImagePlane(),
+        SotNormal(),
     )
 }
 """Every parametrization by its name."""
@@ -38,6 +40,7 @@ __all__ = [
     "InverseDepthToCartesian",
     "InverseScaling",
     "ParallaxAngle",
+    "SotNormal",
     "UnifiedInverseDepth",
     "UnitHomogeneous",
     "check_landmark",

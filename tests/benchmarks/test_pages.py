@@ -9,6 +9,7 @@ from comparison import Parametrizations
 from consistency import Consistency
 from from_rest import FromRest
 from handheld import Handheld
+from noise_or_model import NoiseOrModel
 from one_run import OneRunStudy
 from pages import MARK, pages, read, rewritten, value_of
 from published import Tables
@@ -25,9 +26,9 @@ from benchmarks.speed.gpu import OnGpu
 RESULTS = read(Path("benchmarks/results"))
 OF_RESULTS = [page for page in pages() if MARK.search(page.read_text())]
 WRITERS = [
-    CalibrationStudy, Consistency, Disturbances, Endurance, FromRest, Handheld, OnGpu, OneRunStudy,
-    Parametrizations, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps, Tables,
-    Verdicts,
+    CalibrationStudy, Consistency, Disturbances, Endurance, FromRest, Handheld, NoiseOrModel, OnGpu,
+    OneRunStudy, Parametrizations, RealLogs, RecordedLoops, Rendered, Sequences, Starts, Submaps,
+    Tables, Verdicts,
 ]  # fmt: skip
 SAID = {
     "the best of all parametrizations": """min(

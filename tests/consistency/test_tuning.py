@@ -11,7 +11,14 @@ import pytest
 
 import jaxslam
 from jaxslam.consistency import draw, fit_of, log_likelihood, of_simulation
-from jaxslam.consistency.tuning import NOISE, TuningSettings, _outliers, _records, _Search
+from jaxslam.consistency.tuning import (
+    NOISE,
+    TuningSettings,
+    _outliers,
+    _records,
+    _Search,
+    _whiteness,
+)
 from jaxslam.models.observations import Features, Innovation
 
 MOTION = jaxslam.Odometry([0.02, 0.03, 0.01])
@@ -107,6 +114,18 @@ def test_a_number_that_is_left_out_costs_as_one_of_so_many_sigma():
     found = _records(innovation, jaxslam.Frames(None, seen, seen))
     assert (found.cost, found.log_det, found.nis, found.dof, found.left_out) == (-1.5, -8, 5, 4, 2)
     assert _outliers(found, TuningSettings(outlier=3.0)) == ((9 - 8 / 4) / 2, 6.0)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_mean_of_one_landmark_alone_is_seen():
+    """Where neighbours hardly correlate: of 0.3 σ in one of six slots."""
+    white = np.random.default_rng(0).normal(size=(300, 6, 2))
+    (_, _, right), found = _whiteness([white]), _whiteness([white + 0.3 * np.eye(6)[0, :, None]])
+    correlation, mean, p = np.abs(np.array(found, float))
+    assert float(right or 0) > 0.01
+    assert correlation < 0.05
+    assert p < 1e-3
+    assert mean < 0.12
 
 
 @pytest.mark.usefixtures("unchecked")

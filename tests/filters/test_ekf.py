@@ -18,8 +18,9 @@ from jaxslam.filters.linear.kalman import Kalman
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import make_filter
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
-from jaxslam.landmarks import LANDMARKS, InverseScaling
+from jaxslam.landmarks import LANDMARKS, ImagePlane, InverseScaling, SotNormal
 from jaxslam.models.calibration import White
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
@@ -327,3 +328,31 @@ def test_products_with_blocks_leave_out_only_zeros(dense, monkeypatch):
     J = Blocks(*(jnp.asarray(rng.normal(size=s)) for s in ((v, c), (m, k, v), (m, k, d))))
     slots, B = jnp.array([4, 0, 4]), jnp.asarray(rng.normal(size=(c + capacity * d, 7)))
     close(observed(J, slots, B), placed(J, slots, capacity) @ B, 1e-14)
+
+
+class Charted(SotNormal):
+    """A ray of unit length and one over the range: the equivariant filter's other chart."""
+
+    name = "sot_inverse_depth"
+
+    def initialise(self, point, omega, focal):
+        return jnp.append(point, omega) / jnp.linalg.norm(point)
+
+    def homogeneous(self, landmark):
+        return landmark[:-1] / jnp.linalg.norm(landmark[:-1]), landmark[-1]
+
+
+def test_the_equivariant_filter_in_inverse_depth_is_that_of_the_image_plane():
+    """1/range and 1/z differ by a factor of the bearing: the filters do by products with a
+    bearing's error alone, where that in normal coordinates goes another way."""
+    case = Case("matched", steps=8, landmarks=5, placement="prior")
+    landmarks = ImagePlane(), Charted(), SotNormal()
+    filters = (make_filter("robocentric", landmark=x, **case.pieces()) for x in landmarks)
+    found = [
+        quick_jit(partial(run_filter, case.capacity, slam))(case.controls(), *case.frames(0))[1]
+        for slam in filters
+    ]
+    sigma = np.sqrt(np.diagonal(found[0][1], axis1=1, axis2=2))
+    off = [jax.vmap(difference)(poses, found[0][0]) / sigma for poses, *_ in found[1:]]
+    assert np.abs(off[0]).max() < 1e-3
+    assert np.abs(off[1]).max() > 0.1

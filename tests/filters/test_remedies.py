@@ -262,34 +262,36 @@ def test_a_decoupled_correction_moves_the_pose_by_its_group(geometry):
     assert np.abs(difference).max() > 1e-9
 
 
-def test_oc_in_the_world_is_the_affine_filter():
-    """Song et al., arXiv:2412.10809: with a rotation's error in B, `P ← A P Aᵀ`, A the identity but
-    for `S(p) − S(p⁺)` of the position and of every landmark."""
+def test_oc_in_the_world_is_the_transformed_and_the_affine_filter():
+    """Hao, Tian, He, arXiv:2502.05008 and 2510.23359: an EKF of errors `z = T(x) δ` whose gauge is
+    constant, here `δp + p × θ` of the position and of every landmark, with θ in B. Of the affine
+    filter (Song et al., arXiv:2412.10809) A is `T(x⁺)⁻¹ T(x)`."""
     slam, before, seen, after = second_update("world+oc", SPATIAL)
-    control = positions(SPATIAL).controls()[2]
-    plain = replace(slam, correction=positions(SPATIAL).filter("world", "cartesian").correction)
-    added, _ = quick_jit(lambda: plain.update(before, control, seen))()
+    predicted, _, H = quick_jit(lambda x: observe(slam.model, x, seen.slots, COMPOSED))(before)
 
-    def in_base(state):
-        """The Jacobian to coordinates whose rotation error is in B: `R Exp(θ) = Exp(R θ) R`."""
-        rotation = state.core.pose.rotation.as_matrix()
-        return jnp.eye(len(state.covariance)).at[3:6, 3:6].set(rotation)
+    def transformation(state):
+        """From coordinates whose rotation error is in the camera: `R Exp(θ) = Exp(R θ) R`."""
+        core = state.core
+        rotation = core.pose.rotation.as_matrix()
+        T = jnp.eye(len(state.covariance)).at[3:6, 3:6].set(rotation)
+        landmarks = enumerate(state.landmarks)
+        places = [(state.core_dim + 3 * i, p) for i, p in landmarks if state.active[i]]
+        for row, p in [(0, core.pose.translation), *places]:
+            T = T.at[row : row + 3, 3:6].set(jnp.cross(p, rotation.T).T)
+        return T
 
-    def cross(x):
-        return jacobian(lambda y: jnp.cross(x, y), jnp.zeros(3))
-
-    A = jnp.eye(len(before.covariance))
-    c = before.core_dim
-    places = [(0, before.core.pose.translation, added.core.pose.translation)]
-    points = zip(before.landmarks, added.landmarks, strict=True)
-    places += [(c + 3 * i, *pair) for i, pair in enumerate(points) if before.active[i]]
-    for row, old, new in places:
-        A = A.at[row : row + 3, 3:6].set(cross(old - new))
-    # The update's covariance, as the published filter has it, at the pose before and after.
-    before_to_base, after_to_base = in_base(before), in_base(added)
-    expected = A @ before_to_base @ added.covariance @ before_to_base.T @ A.T
-    found = after_to_base @ after.covariance @ after_to_base.T
-    close(found, expected, 1e-10)
+    used = np.repeat(seen.valid & before.active[seen.slots], 3)
+    T, T_after = transformation(before), transformation(after)
+    H = placed(H, seen.slots, len(before.active))[used] @ jnp.linalg.inv(T)
+    P, R = T @ before.covariance @ T.T, noises(slam.sensor, seen.measured)
+    K = P @ H.T @ jnp.linalg.inv(H @ P @ H.T + jnp.kron(jnp.eye(used.sum() // 3), R))
+    z = K @ (seen.measured - predicted).ravel()[used]
+    close(minus(after, before), jnp.linalg.solve(T, z), 1e-9)
+    root = jnp.linalg.inv(T_after)
+    close(after.covariance, root @ (P - K @ H @ P) @ root.T, 1e-9)
+    plain = replace(slam, correction=Kalman())
+    added, _ = quick_jit(lambda: plain.update(before, positions(SPATIAL).controls()[2], seen))()
+    assert np.abs(after.covariance - added.covariance).max() > 1e-4 * added.covariance.max()
 
 
 def predicted(slam, world):

@@ -14,6 +14,7 @@ from jaxslam.landmarks import (
     InverseDepthToCartesian,
     InverseScaling,
     ParallaxAngle,
+    SotNormal,
     UnifiedInverseDepth,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
@@ -54,7 +55,9 @@ forms = [*each_landmark, Converted(), Anchored()]
 with_geometry = pytest.mark.parametrize("geometry", each_geometry, ids=named)
 every_landmark = pytest.mark.parametrize("landmark", forms, ids=named)
 at_infinity = pytest.mark.parametrize(
-    "landmark", [p for p in forms if not isinstance(p, Cartesian | Converted)], ids=named
+    "landmark",
+    [p for p in forms if not isinstance(p, Cartesian | Converted | SotNormal)],
+    ids=named,
 )
 
 
@@ -137,6 +140,22 @@ def test_parameters_are_the_published_ones(geometry):
     expected = [*np.zeros(ray.size), *angles, 0.2 / np.linalg.norm(ray)]
     np.testing.assert_allclose(parameters, expected, rtol=1e-14)
     np.testing.assert_allclose(transform(T, parameters)[: ray.size], T.translation(), atol=1e-15)
+
+
+@with_geometry
+def test_a_correction_in_normal_coordinates_is_one_of_sot(geometry):
+    """`e^l Exp(θ) p`, of which the equivariant filter's has |θ| = |δ| and this one `arctan |δ|`:
+    δ across the ray turns it towards δ, and the range is exact."""
+    parameters, euclidean = generic(SotNormal(), geometry), functions(SotNormal())[-1]
+    point, ray = np.asarray(euclidean(parameters)), np.asarray(parameters[:-1])
+    away = np.random.default_rng(0).normal(size=ray.size)
+    away -= (away @ ray) * ray
+    delta = 0.1 * away / np.linalg.norm(away)
+    moved = np.asarray(euclidean(parameters + np.append(delta, 0.3)))
+    np.testing.assert_allclose(np.linalg.norm(moved), np.exp(0.3) * np.linalg.norm(point))
+    turned = np.cos(0.1) * ray + np.sin(0.1) * delta / 0.1
+    np.testing.assert_allclose(angle_between(moved, turned), 0.1**3 / 3, rtol=0.01)
+    np.testing.assert_allclose(angle_between(moved, ray), np.arctan(0.1), rtol=1e-12)
 
 
 def angle_between(a, b):

@@ -21,6 +21,7 @@ OTHERS = [
     "robocentric+iterated3+mean", "robocentric+drift", "robocentric+checked",
     "scale_gauge+directions3", "scale_gauge+mixture3+rest4",
     "world+particles", "robocentric+rays", "robocentric+nodes", "recommended",
+    "robocentric/sot_normal",
 ]  # fmt: skip
 LONG = ("a batch is", "single precision", "its derivative")
 EXCEPT = {
@@ -49,7 +50,8 @@ ROWS = [
 @cache
 def case(name):
     ends_in = {"particles": "cartesian", "rays": "cartesian", "nodes": "image_plane"}
-    landmark = ends_in.get(name.rpartition("+")[2], "inverse_scaling")
+    name, _, landmark = name.partition("/")
+    landmark = landmark or ends_in.get(name.rpartition("+")[2], "inverse_scaling")
     return FilterCase(make_filter(name, landmark=landmark, **scenario_pieces(WORLD)), WORLD)
 
 

@@ -7,8 +7,8 @@ from an error how much of it is gauge, `L` with `L N(x) = I`, and carry that muc
     M = I + (N(x⁺) − N(x)) L,    P ← M P Mᵀ,    M N(x) = N(x⁺).
 
 With the ordinary Jacobian Φ at x⁺, `Φ* = Φ M` has `Φ* N_{k|k-1} = N_{k+1|k}` (Hesch et al., IJRR
-2014), and nothing else in the filter changes. It is the covariance's correction in T-EKF 2 of Hao,
-Tian and He (arXiv:2502.05008, 2025).
+2014), and nothing else in the filter changes. For Cartesian landmarks in the base frame M is the
+`T(x⁺)⁻¹ T(x)` of Hao, Tian and He (arXiv:2502.05008, 2025), whose error `T(x) δ` has a constant N.
 """
 
 from __future__ import annotations
