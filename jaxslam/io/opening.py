@@ -76,6 +76,9 @@ def open_recording(path: str | Path, rate: float = 30.0) -> Recording:
         if layout.recognises(path):
             return layout.open(path, rate)
     if not path.exists():
+        before = str(path).rpartition(":")[0]
+        if before and Path(before).exists():
+            raise ValueError(f"{before} is no bag: only a bag has topics")
         raise ValueError(f"{path}: no such file or folder")
     names = "; ".join(layout.name for layout in LAYOUTS)
     raise ValueError(f"{path}: {_found(path)}, not a known kind of source; known: {names}")

@@ -8,7 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
+from jaxslam._numerics.arrays import (
+    AnyArray,
+    Number,
+    check_numbers,
+    check_shape,
+    number_field,
+    optional_numbers,
+)
 
 
 class InverseDepth(eqx.Module):
@@ -51,6 +58,7 @@ class InverseDepth(eqx.Module):
     @staticmethod
     def beyond(nearest: Number) -> InverseDepth:
         """The paper's: 96 % from `nearest` (d_min, metres) to infinity. Raises ValueError."""
+        check_numbers("the nearest depth", nearest, "positive")
         return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))
 
     @staticmethod

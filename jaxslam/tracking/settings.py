@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._numerics.arrays import check_numbers
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
@@ -29,6 +30,8 @@ METRIC = "world"
 """The filter where a target says how long a metre is."""
 INERTIAL = "robocentric+drift20"
 """The filter where an inertial unit does: `recommended` for its motion, and landmarks drift."""
+POSITIVE = "wanted", "new_per_frame", "nearest_depth", "pixel_sigma", "patience", "spacing"
+"""Numbers of which 0 makes no sense."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,8 @@ class TrackerSettings:
     """The assumptions of a tracker and how much it does.
 
     Lengths are in the unit of `nearest_depth`: a single camera does not see scale, so the map's
-    unit is whatever that prior makes it. Raises ValueError for names that are not known and for a
-    readout that is no time.
+    unit is whatever that prior makes it. Raises ValueError for names that are not known, and for
+    numbers that make no sense.
     """
 
     filter: str = "recommended+walk3+drift20"
@@ -105,8 +108,10 @@ class TrackerSettings:
         lookup("association", [self.association], ASSOCIATIONS)
         if self.calibration is not None:
             lookup("calibration", [self.calibration], TREATMENTS)
-        if not 0 <= self.readout < np.inf:
-            raise ValueError(f"readout is a time of 0 s or more, not {self.readout} s")
+        if not 0 <= self.readout <= 1:
+            raise ValueError(f"readout is a time from 0 to 1 s, such as 20ms, not {self.readout} s")
+        for name, value in vars(self).items():
+            check_numbers(name, value, "positive" if name in POSITIVE else "not negative")
 
     @property
     def capacity(self) -> int:

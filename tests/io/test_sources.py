@@ -78,6 +78,7 @@ REFUSED = [
     (timestamped, listed("# empty"), r"timestamps\.txt has no lines"),
     (plain, wide, "image 0 is 66x48"),
     (lambda x: x / "nowhere", nothing, "no such file or folder"),
+    (lambda x: f"{x}:/camera", nothing, "is no bag: only a bag has topics"),
     (lambda x: plain(x) / "notes.md", nothing, r"a file \.md, not a known kind of source; known:"),
     (empty, nothing, "a folder with nothing in it, not a known kind"),
     (empty, deeper, r"a folder with a\.txt, deeper/, …, not a known .* EuRoC"),

@@ -75,5 +75,6 @@ def test_it_needs_a_velocity():
     slam = a_filter(each_geometry[1])
     with pytest.raises(ValueError, match="a rolling shutter is for a motion whose variables are"):
         replace(slam, motion=Odometry(np.ones(6)), sensor=replace(slam.sensor, line=LINE))
-    with pytest.raises(ValueError, match="readout is a time of 0 s or more, not -1"):
-        TrackerSettings(readout=-1)
+    for time in (-1, 20):
+        with pytest.raises(ValueError, match=f"from 0 to 1 s, such as 20ms, not {time} s"):
+            TrackerSettings(readout=time)

@@ -2,10 +2,12 @@
 
 import json
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
+import jaxslam
 from jaxslam.io.tum import read_tum, write_tum
 from jaxslam.tracking.film import OverlayWriter
 from jaxslam.tracking.pointcloud import read_ply, write_ply
@@ -173,6 +175,11 @@ OF_CALLS = [
      "unknown calibration 'maybe'; known: white, consider"),
     (lambda: TrackerSettings(filter="nothing"), "unknown .* 'nothing'; known:"),
     (lambda: TrackerSettings(landmarks="nothing"), "unknown .* 'nothing'; known:"),
+    *[
+        (partial(TrackerSettings, **{name: value}), f"{name} must .*, not {value}")
+        for name, value in (("nearest_depth", 0), ("wanted", 0), ("spare", -1), ("pixel_sigma", 0))
+    ],
+    (lambda: jaxslam.InverseDepth.beyond(-1.0), "the nearest depth must be positive, not -1.0"),
     *[
         (begun_with_a_target(filter=name), rf"filter {name.replace('+', '.')} cannot begin with a")
         for name in ("scale_gauge", "world+scene50", "world+mixture3")
