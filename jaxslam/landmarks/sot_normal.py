@@ -27,7 +27,7 @@ class SotNormal(AbstractLandmark):
 
     name: ClassVar[str] = "sot_normal"
     parameters: ClassVar[str] = "(m, λ)"
-    point: ClassVar[str] = "e^λ m/|m|"
+    point: ClassVar[str] = "e^λ m/‖m‖"
     source: ClassVar[str] = "van Goor et al., Automatica 2021"
 
     def size(self, n: int) -> int:
