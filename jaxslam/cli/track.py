@@ -87,7 +87,8 @@ class TrackOptions:
     pixel_sigma: float = TrackerSettings.pixel_sigma
     """Standard deviation of a match, pixels."""
     readout: Annotated[str, tyro.conf.arg(metavar="TIME")] = "0ms"
-    """Time from the first row's exposure to the last row's, of a rolling shutter, such as 20ms."""
+    """Time from the first row's exposure to the last row's, of a rolling shutter, such as 20ms; a
+    number alone is in seconds."""
     acceleration_sigma: float = TrackerSettings.acceleration_sigma
     """Standard deviation of the linear acceleration, map units/s²."""
     angular_acceleration_sigma: float = TrackerSettings.angular_acceleration_sigma

@@ -33,6 +33,8 @@ from jaxslam.simulation import (
 
 MapChunks = Callable[[Callable[[range], Any], list[range]], Iterator[tuple[range, Any]]]
 """A function that applies another to chunks, and yields each with its result when finished."""
+DRAWN = 2**27
+"""Bytes of runs that are kept, as every filter is given the same."""
 
 
 class Simulator:
@@ -56,6 +58,7 @@ class Simulator:
         self.dtype, self.size = jnp.dtype(dtype), size
         self.sensor = cast(world.sensor, dtype)
         self._world, self._key = as_data(world, dtype), jax.random.key(seed)
+        self._drawn: dict[int, tuple[Run, Room]] = {}
 
     @property
     def made_by(self) -> Manifest:
@@ -75,7 +78,13 @@ class Simulator:
 
     def __call__(self, chunk: range) -> tuple[Run, Room]:
         """Return the chunk's runs, padded to `size` by the runs that follow."""
-        return _draw(self._world, self._key, chunk.start + jnp.arange(self.size))
+        drawn = self._drawn.get(chunk.start)
+        if drawn is None:
+            drawn = _draw(self._world, self._key, chunk.start + jnp.arange(self.size))
+            size = sum(x.nbytes for x in jax.tree.leaves(drawn))
+            if size * (1 + len(self._drawn)) < DRAWN:
+                self._drawn[chunk.start] = drawn
+        return drawn
 
     def max_sightings(self, chunk: range) -> Room:
         """Return the most that any of the chunk's runs sees."""
