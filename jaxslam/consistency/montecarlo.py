@@ -189,9 +189,7 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
     if isinstance(filters, Iterable) and not isinstance(filters, Mapping):
         filters = list(filters)
         if filters and all(isinstance(word, str) for word in filters):
-            words = (word.partition("/") for word in filters)
-            made = [make_filters(scenario, name, of or "inverse_scaling") for name, _, of in words]
-            return {name: slam for each in made for name, slam in each.items()}
+            return make_filters(scenario, filters)
     if not filters or not isinstance(filters, Mapping):
         raise ValueError(
             "no filters by name: a dict is accepted, as make_filters gives it, or a list of words "

@@ -171,19 +171,20 @@ def make_filters(
     landmarks: str | Iterable[str] = "inverse_scaling",
     calibration: str | None = None,
 ) -> dict[str, AbstractFilter]:
-    """Every named filter on every named parametrization, keyed `filter/landmarks`.
+    """Every named filter on every named parametrization, keyed `filter/landmarks`; one that is
+    named so, as `robocentric/inverse_depth`, on that alone.
 
     Their numbers are the scenario's, which may be given by name; one name may be given without a
     list. A filter may be modified: `world+oc`, `scale_gauge+mixture9`. The calibration is treated
     as the scenario says, unless another treatment is named. Raises ValueError.
     """
-    scenario, names = as_scenario(scenario), as_list(filters)
-    lookup("filters", [name.partition("+")[0] for name in names], FILTERS)
+    scenario, names = as_scenario(scenario), [name.partition("/") for name in as_list(filters)]
+    lookup("filters", [name.partition("+")[0] for name, _, _ in names], FILTERS)
     pieces = scenario_pieces(scenario, calibration)
     return {
         f"{name}/{landmark.name}": make_filter(name, landmark=landmark, **pieces)
-        for name in names
-        for landmark in lookup("landmarks", landmarks, LANDMARKS).values()
+        for name, _, own in names
+        for landmark in lookup("landmarks", own or landmarks, LANDMARKS).values()
     }
 
 

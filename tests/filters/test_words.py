@@ -39,6 +39,10 @@ def test_filters_are_made_of_every_pair_of_names():
         assert slam.calibration == Known()
     (one,) = make_filters("matched", "robocentric", "inverse_scaling", "known").items()
     assert one == ("robocentric/inverse_scaling", made["robocentric/inverse_scaling"])
+    own = make_filters("matched", ["robocentric/cartesian", "world"], ["inverse_depth"])
+    assert [*own] == ["robocentric/cartesian", "world/inverse_depth"]
+    with pytest.raises(ValueError, match=r"unknown landmarks 'cartesion'.*did you mean cartesian"):
+        make_filters("matched", "world/cartesion")
 
 
 @pytest.mark.parametrize(
