@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Float, PyTree
 
@@ -54,6 +55,11 @@ def number_field(**options: Any) -> Any:
 def is_number(leaf: PyTree) -> bool:
     """Whether a leaf is data, to be traced, batched and differentiated."""
     return isinstance(leaf, jax.Array | np.ndarray | jax.ShapeDtypeStruct)
+
+
+def is_known(leaf: PyTree) -> bool:
+    """Whether it is one number or an array of them, which is not being traced."""
+    return isinstance(leaf, int | float | np.ndarray | jax.Array) and not isinstance(leaf, Tracer)
 
 
 def cast(tree: T, dtype: DTypeLike) -> T:
@@ -105,7 +111,7 @@ def check_numbers(what: str, value: Any, least: str = "") -> None:
     Words, pieces, and numbers that are being traced are let through.
     """
     for one in jax.tree.leaves(value) if isinstance(value, tuple) else (value,):
-        for number in np.ravel(one).tolist() if isinstance(one, int | float | np.ndarray) else ():
+        for number in np.ravel(one).tolist() if is_known(one) else ():
             if not math.isfinite(number):
                 raise ValueError(f"{what} holds {number}; it must be finite")
             if least and (number < 0 or (least == "positive" and not number)):

@@ -198,7 +198,9 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
     if wrong := [name for name in filters if not isinstance(name, str) or not name]:
         raise ValueError(f"the name of a filter is a word, not {wrong[0]!r}")
     if wrong := [n for n, slam in filters.items() if not isinstance(slam, AbstractFilter)]:
-        raise ValueError(f"{wrong[0]} is no AbstractFilter but {type(filters[wrong[0]]).__name__}")
+        given = filters[wrong[0]]
+        kind = f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
+        raise ValueError(f"{wrong[0]} is no AbstractFilter but {kind}; an instance is accepted")
     return filters
 
 

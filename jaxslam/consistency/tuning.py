@@ -10,7 +10,7 @@ mean, are those of a wrong model (Mehra 1970).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import NamedTuple
@@ -182,7 +182,7 @@ def tune(
     of JAX. Raises ValueError for names, bounds or logs that do not serve.
     """
     settings, bounds, priors = settings or TuningSettings(), bounds or {}, priors or {}
-    logs, held_out = ([x] if isinstance(x, MeasuredRun) else list(x) for x in (logs, held_out))
+    logs, held_out = (list(x) if isinstance(x, Iterable) else [x] for x in (logs, held_out))
     if not logs or not all(isinstance(log, MeasuredRun) for log in logs + held_out):
         raise ValueError("tune needs logs as `measured_run` makes them, at least one")
     dtype = jnp.result_type(float)

@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.arrays import cast, precision
+from jaxslam._numerics.arrays import AnyArray, cast, check_numbers, check_shape, is_known, precision
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear import covariance as linear
 from jaxslam.filters.linear.blocks import Change, Landmark, Noise, Prior
@@ -24,7 +25,7 @@ from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.protocol import Belief, CameraView, Expected, LandmarkView, OfLandmark
 from jaxslam.geometry import SplitPose, difference, identity
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap
+from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
 from jaxslam.models.sensors import noises
 
 
@@ -44,7 +45,7 @@ class OneGaussian(AbstractLayer):
             state = _with_prior_map(slam, state, known)
         if first is None:
             return state
-        check_features(slam, first)
+        check_features(slam, first, len(state.landmarks))
         return slam.close(with_frames_calibration(slam, state), first)
 
     def predict(self, slam, state, control):
@@ -229,8 +230,9 @@ def each_gaussian(belief: Belief, function: Callable[[State], State]) -> Belief:
     return jax.tree.map(one, belief, is_leaf=is_gaussian)
 
 
-def check_features(slam: AbstractSlam, features: Features) -> None:
-    """Raise ValueError unless they are measurements of the filter's sensor."""
+def check_features(slam: AbstractSlam, features: Features, capacity: int | None = None) -> None:
+    """Raise ValueError unless they are measurements of the filter's sensor, and, where a capacity
+    is given, of as many landmarks in slots of it."""
     m, p = features.slots.shape[-1], slam.sensor.size
     wanted = {"slots": (m,), "measured": (m, p), "valid": (m,)}
     for name, shape in wanted.items():
@@ -240,6 +242,8 @@ def check_features(slam: AbstractSlam, features: Features) -> None:
                 f"features.{name} has shape {found}; {type(slam.sensor).__name__} measures "
                 f"{p} numbers of each of {m} landmarks: it needs {shape}"
             )
+    if capacity is not None and is_known(features.valid):
+        _check_slots("features", features.slots, features.valid, capacity)
 
 
 def _empty(slam: AbstractSlam, capacity: int, dtype: DTypeLike) -> State:
@@ -278,18 +282,29 @@ def _empty(slam: AbstractSlam, capacity: int, dtype: DTypeLike) -> State:
     return state if slam.calibration.each_frame else _with_calibration(slam, state)
 
 
+def _check_slots(whose: str, slots: Slots, valid: Bool[AnyArray, " m"], capacity: int) -> None:
+    if not is_known(slots):
+        return
+    slots = np.asarray(slots)[np.asarray(valid)]
+    inside = (slots >= 0) & (slots < capacity) & (slots % 1 == 0)
+    if not np.all(inside) or len(np.unique(slots)) < slots.size:
+        wanted = f"whole numbers from 0 to {capacity - 1}, each once"
+        raise ValueError(f"the slots of {whose} are {wanted}, not {slots.tolist()}")
+
+
 def _with_prior_map(slam: AbstractSlam, state: State, known: PriorMap) -> State:
     """The state with the landmarks of a prior map: `X ~ N(points, covariance)` in B, which is the
     camera. Their length is the metre: what is not known of the filter's own unit is in them."""
-    m, n = known.points.shape
-    wanted = {
-        "slots": (m,),
-        "points": (m, slam.motion.geometry.point_dim),
-        "covariance": (m * n,) * 2,
-    }
+    m, n = known.slots.size, slam.motion.geometry.point_dim
+    wanted = {"slots": (m,), "points": (m, n), "covariance": (m * n,) * 2}
     for name, shape in wanted.items():
-        if (found := getattr(known, name).shape) != shape:
-            raise ValueError(f"a prior map's {name} has shape {found}; it needs {shape}")
+        check_shape(f"a prior map's {name}", getattr(known, name), shape)
+        check_numbers(f"a prior map's {name}", getattr(known, name))
+    _check_slots("a prior map", known.slots, np.ones(m, bool), len(state.landmarks))
+    if is_known(P := known.covariance):
+        rounding = 1e-5 * np.max(np.abs(P), initial=0.0)
+        if np.any(np.abs(P - P.T) > rounding) or np.any(np.diag(P) < 0):
+            raise ValueError("a prior map's covariance is symmetric, with no variance below 0")
     one, focal = jnp.ones((), state.landmarks.dtype), jnp.asarray(slam.sensor.focal)
 
     def log_scale(core):

@@ -136,6 +136,7 @@ def measured_run(
             f"{len(frame)}, {len(landmark)} and {len(measured)}"
         )
     check_numbers("measured", measured)
+    check_numbers("control", tuple(jax.tree.leaves(control)))
     if len(frame) and not 0 <= frame.min() <= frame.max() <= steps:
         raise ValueError(
             f"frames are those before and after {steps} controls, 0 to {steps}, not "

@@ -68,7 +68,9 @@ def _updated(slam: Slam, word: str, **fields: Any) -> Slam:
 
 def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
     if not slam.frame.moves_landmarks:
-        raise ValueError(f"submaps are of robocentric filters, not of {slam.frame.name} ones")
+        raise ValueError(
+            f"submaps are of the frame robocentric, not of the frame {slam.frame.name}"
+        )
     return replace(slam, frame=Submaps(spare))
 
 
@@ -157,9 +159,11 @@ def _check_one_of_each(words: list[str]) -> None:
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
-    word = modifier if modifier in MODIFIERS else modifier.rstrip("0123456789")
-    lookup("modifiers", [word], MODIFIERS)
+    word = modifier if modifier in MODIFIERS else modifier.rstrip("0123456789.,-%")
     number = modifier[len(word) :]
+    if number and not (word and number.isdecimal()):
+        raise ValueError(f"a modifier takes a whole number behind its name, not as {modifier!r}")
+    lookup("modifiers", [word], MODIFIERS)
     if number and len(signature(MODIFIERS[word]).parameters) < 2:
         raise ValueError(f"modifier {word} takes no number, not {number}")
     return word, [int(number)] if number else []

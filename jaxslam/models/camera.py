@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.arrays import AnyArray, check_shape, numbers
+from jaxslam._numerics.arrays import AnyArray, check_numbers, check_shape, numbers
 from jaxslam.geometry import Point
 from jaxslam.models.lens import AbstractLens, Ideal
 
@@ -32,6 +32,7 @@ class Camera(eqx.Module):
     def __check_init__(self) -> None:
         check_shape("the camera's focal", self.focal, (1,), (2,))
         check_shape("the camera's centre", self.centre, np.shape(self.focal))
+        check_numbers("the camera's focal", self.focal, "positive")
 
     @property
     def intrinsics(self) -> Float[Array, " k"]:

@@ -24,7 +24,14 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
+from jaxslam._numerics.arrays import (
+    AnyArray,
+    Number,
+    check_numbers,
+    check_shape,
+    number_field,
+    optional_numbers,
+)
 from jaxslam.geometry import (
     SPATIAL,
     Geometry,
@@ -98,9 +105,13 @@ def increments(
     Within a reading the specific force is turned by half the reading's rotation. The noise of one
     axis is white; of its course in a step the mean and the slope are kept, two orthonormal
     polynomials: they give the covariances of ΔR and Δv, and of Δp but for what the gyroscope's
-    noise does in third order.
+    noise does in third order. Raises ValueError for other shapes and seconds below 0.
     """
     seconds, gyroscope, accelerometer = map(jnp.asarray, (seconds, gyroscope, accelerometer))
+    check_shape("seconds", seconds, (seconds.size,))
+    check_numbers("seconds", seconds, "not negative")
+    check_shape("gyroscope", gyroscope, (seconds.size, 3))
+    check_shape("accelerometer", accelerometer, (seconds.size, 3))
     bias = jnp.zeros(6, seconds.dtype) if bias is None else jnp.asarray(bias)
     rates, forces = gyroscope - bias[:3], accelerometer - bias[3:]
     turned, sped, moved = _integrated(seconds, rates, forces)

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam.geometry import Scalar
 
 Slots = Int[Array, " m"]
@@ -70,9 +70,9 @@ class PriorMap(eqx.Module):
     `X ~ N(points, covariance)` in the base frame B, metres, in the slots that hold them.
     """
 
-    slots: Int[AnyArray, " m"]
-    points: Float[AnyArray, "m n"]
-    covariance: Float[AnyArray, "m*n m*n"]
+    slots: Int[AnyArray, " m"] = eqx.field(converter=jnp.asarray)
+    points: Float[AnyArray, "m n"] = number_field()
+    covariance: Float[AnyArray, "m*n m*n"] = number_field()
     """Joint, as a map of yesterday has it; of points that are independent block-diagonal."""
 
 

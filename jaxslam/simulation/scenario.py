@@ -207,6 +207,11 @@ def own_piece(kind: str, given: Value) -> Value:
         return given
     options = dict(given) if isinstance(given, Mapping) else {"type": given}
     word = options.pop("type", None)
+    if options and isinstance(word, str) and word in PLACES:
+        own = ", ".join(PLACES[word])
+        raise ValueError(
+            f"{word} takes no {', '.join(options)}; its fields of a scenario are {own}"
+        )
     if not isinstance(word, str) or word.count(":") != 1:
         raise ValueError(
             f"scenario field {kind} is a word, module:Class, a table of type and what that takes, "

@@ -281,6 +281,7 @@ def test_sizes_that_make_no_sense_are_refused(sizes, message):
         ({1: "world"}, "the name of a filter is a word, not 1"),
         ({"": "world"}, "the name of a filter is a word, not ''"),
         ({"a": "world"}, "a is no AbstractFilter but str"),
+        ({"a": jaxslam.Slam}, "a is no AbstractFilter but the class Slam; an instance is accepted"),
         ({}, "no filters by name"),
         *((x, "a dict is accepted, .* or a list of words") for x in ([], None, 3, [SCENARIO])),
     ],

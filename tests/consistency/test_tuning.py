@@ -139,6 +139,7 @@ def test_a_mean_of_one_landmark_alone_is_seen():
         (["sensor.sigma"], {"bounds": {"sensor.sigma": (1, 2)}}, "outside its bounds"),
         (["sensor.sigma"], {"logs": []}, "logs as `measured_run` makes them, at least one"),
         (["sensor.sigma"], {"logs": ["log"]}, "logs as `measured_run` makes them, at least one"),
+        (["sensor.sigma"], {"logs": TuningSettings()}, "logs as `measured_run` makes them, at"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_tuned_is_refused(logs, names, options, message):
@@ -183,6 +184,8 @@ def test_measurements_that_do_not_go_together_are_refused():
         jaxslam.measured_run([[0, 0, 0], [0, 0, 0]], [0, 0.5], [1, 1], np.zeros((2, 2)))
     with pytest.raises(ValueError, match="measured holds nan"):
         jaxslam.measured_run([[0, 0, 0], [0, 0, 0]], [0, 1], [1, 1], np.full((2, 2), np.nan))
+    with pytest.raises(ValueError, match="control holds nan"):
+        jaxslam.measured_run([[0, 0, 0], [0, 0, np.nan]], [0, 1], [1, 1], np.zeros((2, 2)))
 
 
 @pytest.mark.slow  # a gate that shrinks σ to leave out more

@@ -90,9 +90,24 @@ def test_a_prior_map_of_another_shape_or_of_no_use_is_refused():
         slam = make_filter(name, landmark=LANDMARKS[landmark], **pieces)
         with pytest.raises(ValueError, match=message):
             slam.init(4, known=known)
-    wrong = replace(known, covariance=known.covariance[:4, :4])
-    with pytest.raises(ValueError, match=r"map's covariance has shape \(4, 4\); it needs \(6, 6\)"):
-        make_filter("world", **pieces).init(4, known=wrong)
+    slam = make_filter("world", **pieces)
+    again = Features(jnp.array([1, 1]), jnp.ones((2, 1)), jnp.ones(2, bool))
+    P, points = np.eye(6), np.ones((3, 2))
+    for given, message in (
+        ((SLOTS, points, P[:4, :4]), r"covariance has shape \(4, 4\); it needs \(6, 6\)"),
+        (([3, 0, 2], points.tolist(), 0.1), r"covariance has shape \(\); it needs \(6, 6\)"),
+        (([1, 1, 2], points, P), r"slots of a prior map .* 0 to 3, each .*, not \[1, 1, 2\]"),
+        (([0, 1, 4], points, P), "slots of a prior map are whole"),
+        (([0, -1, 2], points, P), "slots of a prior map are whole"),
+        ((SLOTS, points * np.nan, P), "map's points holds nan"),
+        ((SLOTS, points, P + np.eye(6, k=1)), "covariance is symmetric"),
+        ((SLOTS, points, -P), "with no variance below 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            slam.init(4, known=PriorMap(*given))
+    for slots in ([1, 1], [-1, 1], [1, 4]):
+        with pytest.raises(ValueError, match="slots of features are whole numbers from 0 to 3"):
+            slam.init(4, replace(again, slots=jnp.array(slots)))
 
 
 class FarIsWorse(Position):

@@ -56,6 +56,11 @@ def test_filters_are_made_of_every_pair_of_names():
         ("world+particle", "cartesian", None, r"modifiers 'particle' \(did you mean particles\?\)"),
         ("world+", "cartesian", None, "unknown modifiers ''"),
         ("world+lag", "cartesian", None, "unknown modifiers 'lag'"),
+        *(
+            (f"robocentric+mixture+scene{number}", "cartesian", None, f"not as 'scene{number}'")
+            for number in ("3.5", "-5")
+        ),
+        ("world+mixture+5", "cartesian", None, "a whole number behind its name, not as '5'"),
         ("world+mean2", "cartesian", None, "modifier mean takes no number, not 2"),
         ("world+oc0", "cartesian", None, "at least 1 step of Gauss–Newton, not 0"),
         ("world+directions2", "cartesian", None, "at least 3 members, not 2"),
@@ -115,7 +120,7 @@ def test_what_is_no_piece_is_refused(piece, wanted):
 DELAYED = "delayed initialisation|switch the form of ray|needs landmarks that are written"
 ONE = ("fej", "fej2", "decoupled", "oc")
 IN_WORLD = (
-    ({"submaps"}, "submaps are of robocentric filters, not of world ones"),
+    ({"submaps"}, "submaps are of the frame robocentric, not of the frame world"),
     *(({*pair}, "a filter has one correction, not ") for pair in itertools.combinations(ONE, 2)),
     *(
         pair

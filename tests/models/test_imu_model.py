@@ -213,6 +213,20 @@ def test_the_camera_moves_as_it_is_mounted_on_the_unit():
     assert estimated.start()[1].shape == (18, 18)
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("seconds", "gyroscope", "told"),
+    [
+        ([0.1, -0.1], np.zeros((2, 3)), "seconds must not be negative, not -0.1"),
+        ([[0.1], [0.1]], np.zeros((2, 3)), r"seconds has shape \(2, 1\); it needs \(2,\)"),
+        ([0.1, 0.1], np.zeros((3, 3)), r"gyroscope has shape \(3, 3\); it needs \(2, 3\)"),
+    ],
+)
+def test_readings_that_make_no_sense_are_refused(seconds, gyroscope, told):
+    with pytest.raises(ValueError, match=told):
+        increments(seconds, gyroscope, np.zeros((2, 3)))
+
+
 @pytest.mark.parametrize(
     ("fields", "told"),
     [

@@ -107,8 +107,10 @@ def test_only_a_camera_has_a_calibration_that_can_be_off(geometry, make):
         (lambda: RangeBearing(0.1), "sigma of range and bearing has shape"),
         (lambda: Position([0.1, 0.2], point_dim=3), "a position's sigma has shape"),
         (lambda: Pinhole(Camera([650.0], [320.0]), [0.3, 0.3]), "a pixel's sigma has shape"),
+        (lambda: Camera([-650.0], [320.0]), "the camera's focal must be positive, not -650.0"),
+        (lambda: Camera(jnp.zeros(2), jnp.ones(2)), "the camera's focal must be positive, not 0"),
     ],
 )
-def test_sigmas_that_do_not_fit_are_refused(make, message):
+def test_numbers_that_do_not_fit_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -136,6 +136,10 @@ def test_pieces_of_ones_own_are_named_in_files(mine):
         ({"sensor": "thine:Sonar"}, "scenario field sensor: thine:Sonar: No module named 'thine'"),
         ({"sensor": "none.py:Sonar"}, "scenario field sensor: none.py:Sonar: .*No such file"),
         ({"sensor": "sonar"}, "sensor is 'sonar'; known: camera, .*, or module:Class"),
+        (
+            {"sensor": {"type": "range_bearing", "sigm": 0.1}},
+            "range_bearing takes no sigm; its fields of a scenario are range_bearing_sigma",
+        ),
         ({"sensor": {"sigma": 1}}, "scenario field sensor is a word, module:Class, a table"),
         ({"sensor": {"type": "mine:Sonar", "sigm": 1}}, "sensor: mine:Sonar: .*sigm"),
         ({"sensor": "mine:Walk"}, "sensor is an instance of AbstractSensor, not Walk"),

@@ -94,7 +94,7 @@ class AbstractDelayed(AbstractFilter):
         state = Delayed(gaussian, self.even(room.landmarks, precision(self.slam)))
         if first is None:
             return state
-        check_features(self.slam, first)
+        check_features(self.slam, first, room.landmarks)
         return self.begin(
             replace(state, gaussian=with_frames_calibration(self.slam, gaussian)), first
         )

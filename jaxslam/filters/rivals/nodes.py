@@ -163,7 +163,7 @@ class Nodes(AbstractFilter):
         state = NodeGraph(node, velocity, root, node, same, sure, same, sure)
         if first is None:
             return state
-        check_features(slam, first)
+        check_features(slam, first, count)
         return replace(state, node=self._coalesced(state, first, jnp.array(True), root)[0])
 
     def step(self, state: NodeGraph, control: Control, seen: Features, new: Features) -> Corrected:
