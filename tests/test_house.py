@@ -176,7 +176,7 @@ def test_the_house_does_not_grow():
         for module in imports(path)
     }
     assert len({(above, below) for above, below in arrows if above != below}) <= 81
-    assert sum(code_lines(path) for path in FILES if "native" not in path.parts) <= 20_857
+    assert sum(code_lines(path) for path in FILES if "native" not in path.parts) <= 20_900
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):
