@@ -77,7 +77,8 @@ def client():
 
 
 MODIFIED = {
-    "fej": ("world+fej", "matched"),
+    **{word: (f"world+{word}", "matched") for word in ("fej", "fej2", "decoupled")},
+    "walk": ("robocentric+scene50+walk", "matched"),
     "rest": ("recommended+rest4", "standstill"),  # a window of few frames compiles sooner
     "submaps": ("robocentric+submaps", "laps"),
 }
