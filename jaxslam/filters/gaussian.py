@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, check_numbers, check_shape, is_known, precision
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
@@ -25,7 +25,7 @@ from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.protocol import Belief, CameraView, Expected, LandmarkView, OfLandmark
 from jaxslam.geometry import SplitPose, difference, identity
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
+from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap
 from jaxslam.models.sensors import noises
 
 
@@ -282,7 +282,7 @@ def _empty(slam: AbstractSlam, capacity: int, dtype: DTypeLike) -> State:
     return state if slam.calibration.each_frame else _with_calibration(slam, state)
 
 
-def _check_slots(whose: str, slots: Slots, valid: Bool[AnyArray, " m"], capacity: int) -> None:
+def _check_slots(whose: str, slots: Int[AnyArray, " m"], valid: AnyArray, capacity: int) -> None:
     if not is_known(slots):
         return
     slots = np.asarray(slots)[np.asarray(valid)]
