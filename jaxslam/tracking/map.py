@@ -379,12 +379,9 @@ def note_found(
 
     That nothing at all was found is the camera's failure, and held against no landmark.
     """
-    rows = zip(seen.slots.tolist(), seen.matched.tolist(), seen.pixels, strict=True)
-    noted = {
-        slot: landmarks[slot].searched(ok, pixel, settings.patience)
-        for slot, ok, pixel in rows
-        if seen.matched.any()
-    }
+    table = seen.slots.tolist(), seen.matched.tolist(), seen.pixels
+    rows = zip(*table, strict=True) if seen.matched.any() else ()
+    noted = {s: landmarks[s].searched(ok, at, settings.patience) for s, ok, at in rows}
     return {
         slot: noted.get(slot) or replace(one, unseen=one.unseen + 1)
         for slot, one in landmarks.items()
